@@ -11,6 +11,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import Demand, DeviceModel
+from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform
@@ -157,18 +158,18 @@ def needed(
 def _need_of_waveform(
     scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array]
 ) -> Need:
-    """A target waveform, over all the frequencies that are rendered; its ends leave 0.1 % of the energy outside."""
+    """A target waveform, over all the frequencies that the law drives; its ends leave 0.1 % of the energy outside."""
     from scipy.signal import lfilter  # only waveforms need it, and its import takes a second
 
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
-    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= min(model.highest_frequency, 0.4 * model.rate))
+    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= NYQUIST_MARGIN * model.rate)
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
     spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
-    drive = np.fft.irfft(spectrum * per_target(frequency), len(time))
+    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(time))
     pole = -math.expm1(-1.0 / (model.rate * scene.device_profile.limits.rms_time))
     rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())

@@ -94,3 +94,12 @@ def test_methods_that_play_bands_refuse_a_whole_waveform(device, method):
     scene = hr.Scene(texture=texture, finger=hr.Finger.sliding(speed=0.1), device=device, duration=0.1, method=method)
     with pytest.raises(ValueError, match="texture.carriers is missing: must be >= 1"):
         hr.prepare(scene).controller()
+
+
+def test_a_chirp_beyond_the_judged_band_is_played_up_to_what_the_rate_carries():
+    """Its drive counts as needed, so that nothing stops it; above 0.45 of the rate there is an image, not a chirp."""
+    chirp = hr.Chirp(start=1000.0, stop=1900.0, duration=0.5, amplitude=5e-6)
+    recording = hr.render(hr.Scene(texture=chirp, duration=0.5))
+    assert abs(recording.motion[500:, 0]).max() == pytest.approx(5e-6, rel=0.1)
+    with pytest.raises(ValueError, match=r"texture\.stop = 2300\.0: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
+        hr.render(hr.Scene(texture=hr.Chirp(start=50.0, stop=2300.0, duration=1.0, amplitude=1e-6), duration=0.1))

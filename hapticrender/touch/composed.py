@@ -10,7 +10,7 @@ import numpy as np
 
 from hapticrender import checks
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, checked, parameter
+from hapticrender.checks import Validated, checked, parameter, require
 from hapticrender.protocols import Array, Texture
 
 MOST_PARTS = 4096
@@ -19,7 +19,7 @@ LONGEST_PART = 360_000.0  # s
 MOST_CHIRP = 0.01  # m
 READINGS, PLACES = 0.0123 * 10.0 ** np.arange(6), np.linspace(-0.15, 0.15, 1001)  # s, m: where a texture is tried
 SOON = READINGS[:3]  # s
-NOMINAL_RATE = 5000.0  # Hz
+NOMINAL_RATE, HIGHEST = 5000.0, 0.45  # Hz; of the rate
 
 Parts = tuple[tuple[Texture, float], ...]
 
@@ -219,6 +219,7 @@ class Chirp(Validated, Composable):
     """
 
     kind: ClassVar[str] = "chirp"
+    spatial: ClassVar[bool] = False
 
     start: float = parameter(unit="Hz", about="first frequency", above=0, most=1e5)
     stop: float = parameter(unit="Hz", about="last frequency", above=0, most=1e5)
@@ -226,7 +227,10 @@ class Chirp(Validated, Composable):
     amplitude: float = parameter(unit="m", about="peak", above=0, most=MOST_CHIRP)
 
     def bands(self, rate: float) -> Bands:
-        """No carriers (`rate` in Hz is not needed): the whole waveform is played."""
+        """No carriers: the whole waveform is played; a ValueError where `rate` (Hz) does not carry it."""
+        bound = f"<= {HIGHEST * rate:g} Hz, {HIGHEST} of the rate of {rate:g} Hz"
+        for name, frequency in (("start", self.start), ("stop", self.stop)):
+            require(frequency <= HIGHEST * rate, f"texture.{name}", frequency, bound)
         return Bands.none(spatial=False)
 
     def waveform(self, time: Array, position: Array) -> Array:
