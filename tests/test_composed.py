@@ -100,6 +100,6 @@ def test_a_chirp_beyond_the_judged_band_is_played_up_to_what_the_rate_carries():
     """Its drive counts as needed, so that nothing stops it; above 0.45 of the rate there is an image, not a chirp."""
     chirp = hr.Chirp(start=1000.0, stop=1900.0, duration=0.5, amplitude=5e-6)
     recording = hr.render(hr.Scene(texture=chirp, duration=0.5))
-    assert abs(recording.motion[500:, 0]).max() == pytest.approx(5e-6, rel=0.1)
+    assert abs(recording.motion[-250:, 0]).max() > 4.5e-6  # the filters pass 0.9 of it or more
     with pytest.raises(ValueError, match=r"texture\.stop = 2300\.0: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
         hr.render(hr.Scene(texture=hr.Chirp(start=50.0, stop=2300.0, duration=1.0, amplitude=1e-6), duration=0.1))

@@ -78,7 +78,7 @@ def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, 
 
 
 def share_driven(model: DeviceModel, frequency: Array) -> Array:
-    """Share of a waveform's acceleration at `frequency` (Hz, shape (n,)) that the law's filters pass on to the drive."""
+    """Share of a waveform's acceleration at `frequency` (Hz, shape (n,)) that the filters pass on to the drive."""
     top, omega = min(model.highest_frequency, HIGHEST * model.rate), 2 * np.pi * frequency
     second = derivative_filters(float(model.rate), float(top))[2]
     passed = abs(np.polyval(second, np.exp(1j * omega / model.rate)))
