@@ -1,5 +1,6 @@
 """Textures made of textures, arrays and chirps: what they play, in which bands, in a scene file; who refuses them."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -67,10 +68,20 @@ def test_what_has_no_carriers_is_a_waveform(texture, bands, follows):
 
 
 def test_a_playlist_plays_each_from_its_beginning_and_starts_again():
-    played = hr.Playlist([(TONE, 0.31), (CHIRP, 0.5)]).waveform(TIME, AWAY)
+    played = hr.Playlist([(TONE, 0.31), (CHIRP, 0.5)], fade=0.0).waveform(TIME, AWAY)
     np.testing.assert_array_equal(played[:1550], TONE.waveform(TIME[:1550], AWAY[:1550]))
     np.testing.assert_allclose(played[1551:4050], CHIRP.waveform(TIME[1:2500], AWAY[1:2500]), atol=1e-14)
     np.testing.assert_allclose(played[4051:5600], played[1:1550], atol=1e-14)
+
+
+def test_a_playlist_joins_its_parts_without_a_click_where_friction_is_the_slope():
+    parts = [(hr.Grating(frequency=120.0, amplitude=2e-6), 0.5), (hr.Grating(frequency=60.0, amplitude=4e-6), 0.5)]
+    scene = hr.Scene(texture=hr.Playlist(parts), device="electroadhesion", finger=hr.Finger.sliding(0.05), duration=1.5)
+    joined = hr.prepare(scene).requested(TIME, np.zeros(len(TIME)), np.zeros(len(TIME)))
+    hard = hr.prepare(replace(scene, texture=hr.Playlist(parts, fade=0.0)))
+    assert abs(joined).max() < 2 * abs(joined[1000:2000]).max()
+    assert abs(hard.requested(TIME, np.zeros(len(TIME)), np.zeros(len(TIME)))).max() > 1e3 * abs(joined).max()
+    assert hr.render(scene).waveform["places"]["friction"]["waveform_error"] < 0.01
 
 
 @pytest.mark.parametrize("texture", [CHIRP, ARRAY, 0.5 * ARRAY + TONE, hr.Playlist([(TONE + CHIRP, 1.0), (TONE, 0.5)])])

@@ -11,6 +11,7 @@ import numpy as np
 from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, checked, parameter, require
+from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Texture
 
 MOST_PARTS = 4096
@@ -174,12 +175,14 @@ class Sum(Validated, _Composed):
 
 @dataclass(frozen=True)
 class Playlist(Validated, _Composed):
-    """Textures one after another, each from its own t = 0, without a cross-fade; after the last the first again.
+    """Textures one after another, each from its own t = 0; after the last the first again.
 
     Parameters
     ----------
     parts : sequence of (texture, duration in s)
         Duration > 0.
+    fade : float, s
+        In which each comes and goes, 5 ms by default (half of a shorter part); 0: at once.
 
     Examples
     --------
@@ -191,6 +194,7 @@ class Playlist(Validated, _Composed):
     kind: ClassVar[str] = "playlist"
 
     parts: Parts = checked(_read_parts, unit="s", above=0.0, most=LONGEST_PART)
+    fade: float = parameter(5e-3, unit="s", about="in which a part comes and goes; friction is the slope of a texture")
 
     def bands(self, rate: float) -> Bands:
         """No carriers (`rate` in Hz is not needed): the whole waveform is played."""
@@ -203,7 +207,10 @@ class Playlist(Validated, _Composed):
         which, values = np.searchsorted(ends, own, side="right"), np.zeros(own.shape)
         for index, (texture, seconds) in enumerate(self.parts):
             here = which == index
-            values[here] = texture.waveform(own[here] - (ends[index] - seconds), position[here])
+            since = own[here] - (ends[index] - seconds)
+            values[here] = texture.waveform(since, position[here])
+            if self.fade > 0.0:
+                values[here] *= smoothstep(np.minimum(since, seconds - since) / min(self.fade, seconds / 2))
         return values
 
 
