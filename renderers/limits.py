@@ -164,7 +164,8 @@ def _need_of_waveform(
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
-    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= NYQUIST_MARGIN * model.rate)
+    top = min(model.highest_frequency, 0.4 * model.rate) if bands.differentiated else NYQUIST_MARGIN * model.rate
+    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)  # slopes of ridges and turns are cut off
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
     spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
     if bands.differentiated:

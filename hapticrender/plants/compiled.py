@@ -65,7 +65,7 @@ class CompiledPlant:
         self.finger, self.rate, self.delay, self.block = finger, float(rate), delay, block
         self.motion = np.zeros((0, self.motion_channels))
         self._samples = 0
-        self._random = np.random.default_rng(seed)
+        self._random = np.random.default_rng([seed, 2])  # a texture may be drawn from the same seed
         self._last = np.zeros((block, self.drive_channels))
 
     def inputs(self, first: int, n: int) -> Array:
