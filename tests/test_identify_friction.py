@@ -39,8 +39,8 @@ class Screen(Resonator):
 
     rate, block, delay = 10e3, 10, 10
 
-    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0, unit=1.0, lateral=False):
-        self.unit, self.lateral = unit, lateral
+    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0, unit=1.0, lateral=False, skin=0.0):
+        self.unit, self.lateral, self.skin, self.rough = unit, lateral, skin, 0.0
         self.mu, self.gain, self.speed, self.at, self.friction = mu, gain, speed, 0, 0.0
         self.rng = np.random.default_rng(seed)
 
@@ -50,7 +50,8 @@ class Screen(Resonator):
         load = 0.5 + 0.1 * np.sin(2 * np.pi * 1.3 * time)
         sensed = np.empty((len(drive), 1))
         for i, current in enumerate(drive[:, 0]):
-            sensed[i] = self.friction
+            sensed[i] = self.friction + self.rough
+            self.rough += -self.rough / 50 + self.skin * np.sqrt(2 / 50) * self.rng.standard_normal()  # over 5 ms
             whole = self.mu * (load[i] + self.gain * current**2)
             self.friction += (whole - self.friction) * (1 - np.exp(-self.speed / (self.rate * 11.5e-6)))
         position = 0.02 * (1 - 2 * abs((time * self.speed / 0.04) % 2 - 1)) if self.speed else np.zeros(len(drive))
@@ -79,6 +80,21 @@ def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger(kind):
     scene = hr.Scene(texture=texture, finger=finger, duration=0.1, device="electroadhesion", profile=found.profile())
     assert hr.prepare(scene, driver=Screen()).driver.shape.gain == pytest.approx(1.5e4, rel=0.01)
     assert set(found.uncertainty()) == set(found.profile())
+
+
+def test_intervals_of_a_screen_hold_what_skin_leaves():
+    """5 mN that come and go in 5 ms: of ten 95 % intervals fewer than seven hold the truth once in a thousand.
+
+    As if what is left were white they would be ten times too narrow; lag and delay leave a hundredth of them.
+    """
+    inside = {"friction_coefficient": 0, "open_loop_gain": 0}
+    for seed in range(10):
+        found = identify_screen(Screen(seed=seed, skin=5e-3), ElectroadhesionParameters(), hr.Finger.absent())
+        for name, truth in (("friction_coefficient", 0.6), ("open_loop_gain", 1.5e4)):
+            estimate = found.estimates[name]
+            inside[name] += abs(estimate.value - truth) < estimate.interval
+            assert estimate.interval < 0.05 * truth
+    assert min(inside.values()) >= 7
 
 
 def test_what_cannot_be_identified_is_refused():

@@ -8,7 +8,9 @@ A screen's friction under a sliding finger of known load W is a linear regressio
 
     F = mu W + mu g I^2 - c dI^2/dt,  I^2 = I0^2 (1 + cos w t)/2
 
-in which c stands for delay and contact lag.  Intervals are those of white residuals.
+in which c stands for delay and contact lag.  Intervals of the resonance are those of white residuals.  What a screen's
+model leaves (turns of the finger, skin) is not white: its intervals come from the scatter of the scores of whole
+periods of the modulation (the cluster-robust covariance of Liang & Zeger 1986).
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from hapticrender.touch.finger import Finger
 REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spacing of the lines
 RING = 10.0  # time constants of the expected mode that the drive lasts before the record
 SHARE = 0.2  # of the drive's limit: largest drive of the lines
-MODULATION = 20.0  # Hz: of the current of a screen, far below the contact's corner
+MODULATION = 5.0  # Hz: of the current of a screen; what c leaves of a lag of 0.4 ms is 1e-4 of the gain (20 Hz: 1e-3)
 LATE = 0.5  # samples: largest difference of the delay from the driver's
 UNEXPLAINED = 0.1  # largest share of the response that the model may leave
 
@@ -96,7 +98,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     peak = abs(y).argmax()
     begin[3] = np.angle(response(begin) * u / y)[peak] / w[peak] * rate
     fit = least_squares(lambda x: _real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
-    spread = _spread(fit.jac, fit.fun)
+    spread = _spread(fit.jac, fit.fun, np.arange(len(fit.fun)))
     values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]
     names = ("frequency", "quality", "force_constant")
     found = _found("ultrasonic", type(parameters), names, values, values * spread[:3], fit.fun, _real(y) / scale)
@@ -136,7 +138,7 @@ def identify_screen(
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
     mu, gain = found[0], found[1] / found[0]
-    spread = _spread(columns, residual)
+    spread = _spread(columns, residual, np.flatnonzero(sliding) // round(rate / MODULATION))
     values = np.array([mu, gain])
     halves = np.array([spread[0], gain * math.hypot(spread[1] / found[1], spread[0] / mu)])
     changing = columns[:, 1:] @ found[1:]
@@ -144,10 +146,12 @@ def identify_screen(
     return _found("electroadhesion", type(parameters), names, values, halves, residual, changing - changing.mean())
 
 
-def _spread(jacobian: Array, residual: Array) -> Array:
-    """Half-widths of the 95 % intervals of a least-squares fit."""
-    variance = (residual**2).sum() / max(len(residual) - jacobian.shape[1], 1)
-    return SIGMAS_95 * np.sqrt(np.diagonal(np.linalg.inv(jacobian.T @ jacobian)) * variance)
+def _spread(jacobian: Array, residual: Array, group: Array) -> Array:
+    """Half-widths of the 95 % intervals of a least-squares fit; residuals may depend on each other within a `group`."""
+    inverse, groups = np.linalg.inv(jacobian.T @ jacobian), np.unique(group)
+    scores = np.stack([(jacobian[group == each] * residual[group == each, None]).sum(axis=0) for each in groups])
+    covariance = inverse @ (scores.T @ scores) @ inverse
+    return SIGMAS_95 * np.sqrt(np.diagonal(covariance) * len(groups) / max(len(groups) - jacobian.shape[1], 1))
 
 
 def _real(values: Array) -> Array:
