@@ -117,11 +117,11 @@ def checked_settings(
     arrays = (model.mass, model.damping, model.stiffness, frequency, wavenumber, taps)
     numbers = (model.rate, model.delay, least, *(settings[name] for name in OF_LOOP))
     key = (*(each.tobytes() for each in arrays), *numbers)
-    if key not in CHECKED:
-        CHECKED[key] = _checked(model, frequency, settings, wavenumber, taps, least)
-    if len(CHECKED) > MOST_CHECKED:
-        del CHECKED[next(iter(CHECKED))]
-    found = CHECKED[key]
+    found = CHECKED.get(key)  # other threads may leave it out again
+    if found is None:
+        found = CHECKED[key] = _checked(model, frequency, settings, wavenumber, taps, least)
+    for oldest in list(CHECKED)[:-MOST_CHECKED]:
+        CHECKED.pop(oldest, None)
     return found._replace(settings={**settings, **{name: found.settings[name] for name in LOWERED}})
 
 
