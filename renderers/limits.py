@@ -13,6 +13,7 @@ from hapticrender.bands import Bands
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
+from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
@@ -22,6 +23,7 @@ NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image is too close t
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster
+FADED = 20e-3  # s: at both ends of a waveform that is examined
 
 
 def check_path(scene: Scene, half: float, surface: str) -> None:
@@ -119,7 +121,7 @@ class Need(NamedTuple):
 
 def demand(scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform) -> Demand:
     """Return what the targets of a scene need of a plate at most, with the worst finger; see `control.supervisor`."""
-    need = needed(scene, model, bands, waveform, partial(drive_per_target, model))
+    need = needed(scene, model, bands, waveform, partial(drive_per_target, model), NYQUIST_MARGIN * model.rate)
     motion = need.amplitude * max(map(abs, model.profile or (1.0,)))
     lowest = max(need.lowest, model.lowest_frequency / 2)
     return Demand(motion=motion, drive=need.drive, lowest=lowest, highest=max(need.highest, lowest))
@@ -131,15 +133,18 @@ def needed(
     bands: Bands,
     waveform: Waveform,
     per_target: Callable[[Array], Array] | None = None,
+    top: float = 0.0,
 ) -> Need:
     """Amplitude and drive that a scene's targets need of the free device, all channels driven alike.
 
-    `per_target` (drive per target at frequencies in Hz) may state another drive.  A finger-locked carrier of a constant
+    `per_target` (drive per target at frequencies in Hz) may state another drive.  A waveform's is what it needs up to
+    what the device renders, or up to `top` (Hz).  A finger-locked carrier of a constant
     target passes every frequency up to that of the finger's top speed.
     """
     per_target = per_target or (lambda frequency: 1.0 / model.response(frequency).sum(axis=-1)[..., 0])
     if bands.envelope is None:
-        return _need_of_waveform(scene, model, bands, waveform, per_target)
+        top = max(0.0 if bands.differentiated else top, min(model.highest_frequency, 0.4 * model.rate))
+        return _need_of_waveform(scene, model, bands, waveform, per_target, top)
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
     top = bands.frequency + sweep
     low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
@@ -156,18 +161,21 @@ def needed(
 
 
 def _need_of_waveform(
-    scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array]
+    scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array], top: float
 ) -> Need:
-    """A target waveform, over all the frequencies that the law drives; its ends leave 0.1 % of the energy outside."""
+    """A target waveform up to `top` (Hz), 0.1 % of the energy left out at either side.
+
+    It comes and goes smoothly, or the edges of the window would need more drive than the texture.
+    """
     from scipy.signal import lfilter  # only waveforms need it, and its import takes a second
 
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
-    top = min(model.highest_frequency, 0.4 * model.rate) if bands.differentiated else NYQUIST_MARGIN * model.rate
-    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)  # slopes of ridges and turns are cut off
+    kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
-    spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
+    ends = smoothstep(np.minimum(time, time[-1] - time) / min(FADED, time[-1] / 4))
+    spectrum = np.where(kept, turn * np.fft.rfft(target * ends), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
     drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(time))
@@ -175,5 +183,5 @@ def _need_of_waveform(
     rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())
     energy = np.cumsum(abs(spectrum) ** 2)
-    ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
-    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *ends, rms)
+    outer = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
+    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *outer, rms)

@@ -114,3 +114,19 @@ def test_a_chirp_beyond_the_judged_band_is_played_up_to_what_the_rate_carries():
     assert abs(recording.motion[-250:, 0]).max() > 4.5e-6  # the filters pass 0.9 of it or more
     with pytest.raises(ValueError, match=r"texture\.stop = 2300\.0: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
         hr.render(hr.Scene(texture=hr.Chirp(start=50.0, stop=2300.0, duration=1.0, amplitude=1e-6), duration=0.1))
+
+
+def test_edges_of_the_examined_window_are_no_part_of_what_a_waveform_needs():
+    """A tone that begins at its peak and ends at its trough."""
+
+    class Tone:
+        def bands(self, rate):
+            return hr.Bands.none(spatial=False)
+
+        def waveform(self, time, position):
+            return 6e-6 * np.cos(2 * np.pi * 100.5 * np.asarray(time))
+
+    fast = hr.prepare(hr.Scene(texture=Tone(), duration=1.0, profile={"rate": 48e3})).model.demand
+    slow = hr.prepare(hr.Scene(texture=Tone(), duration=1.0)).model.demand
+    assert fast.drive == pytest.approx(slow.drive, rel=0.05)
+    assert fast.highest < 200.0
