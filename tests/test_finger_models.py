@@ -154,24 +154,6 @@ def test_too_few_carriers_are_refused_and_enough_are_not(rng, order):
     assert hr.fit_finger(enough).order == order  # with two carriers only the 2nd order can be fitted
 
 
-def test_what_makes_no_sense_is_refused(rng):
-    data = make_impedance(rng, LIGHT_SECOND, 3, (0.1, 0.49))
-    sure = replace(data, standard_error=0 * data.standard_error)
-    for error, message, arguments in (
-        (ValueError, "standard_error = 0.0: must be > 0 N s/m", {"impedance": sure}),
-        (ValueError, "0 different carriers with data at loads from 3 to 9 N", {"loads": (3.0, 9.0)}),
-        (ValueError, "order = 3: must be 2, 4 or None", {"order": 3}),
-        (TypeError, "impedance = 3: must be what analyse_finger returns", {"impedance": 3}),
-        (ValueError, "loads = .*: must be two loads in N", {"loads": (1.0, 0.5)}),
-    ):
-        with pytest.raises(error, match=message):
-            hr.fit_finger(**{"impedance": data} | arguments)
-    with pytest.raises(ValueError, match="level = 1: must be > 0 and < 1"):
-        hr.fit_finger(data, 2).interval("mass", 1)
-    with pytest.raises(ValueError, match="phalanx_mass.*: must be one of mass, damping, stiffness, load_exponent"):
-        hr.fit_finger(data, 2).interval("phalanx_mass")
-
-
 @pytest.mark.parametrize("exponent", [0.0, 1 / 3])
 @pytest.mark.parametrize("stated", [1.0, 1 / 3])
 def test_the_exponent_is_within_its_error_also_where_the_windows_scatter_more_than_they_state(rng, exponent, stated):

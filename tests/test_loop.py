@@ -127,30 +127,6 @@ def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():
     assert hr.render(scene, driver=simulated(scene, block=7, delay=7)).drive.shape == (502, 2)
 
 
-def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0]), waveform=np.zeros_like):
-    """A texture made of two functions."""
-    kind = type("Own", (), {"bands": lambda _, rate: bands(rate), "waveform": lambda _, t, x: waveform(t)})
-    return hr.Scene(texture=kind(), duration=0.1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"driver": SimulatedDriver}, TypeError, r"driver = SimulatedDriver: must be an instance, not the class"),
-        ({"renderer": object()}, TypeError, r"renderer: must be an object with open\(scene, driver\).*not object"),
-        ({"scene": own(lambda rate: None)}, TypeError, "Own.bands returned NoneType: must be hapticrender.Bands"),
-        (
-            {"scene": own(waveform=lambda t: t[:-1])},
-            ValueError,
-            r"Own.waveform returned float64 of shape \(\d+,\): must be",
-        ),
-    ],
-)
-def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
-    with pytest.raises(error, match=message):
-        hr.render(**{"scene": TONE, **arguments})
-
-
 scene_with = partial(dataclasses.replace, TONE)
 
 
