@@ -94,8 +94,12 @@ def sampled(waveform, spatial=False):
     return SampledTexture(Own(waveform, spatial), 5000.0)
 
 
+def in_blocks(size=25):
+    return plate_controller(make_bands(47.0, 1e-6), delay=size, block=size)
+
+
 def entry():
-    return RealtimeEntry(plate_controller(make_bands(47.0, 1e-6)))
+    return RealtimeEntry(in_blocks(1))
 
 
 def played_late(method):
@@ -121,6 +125,13 @@ def driver(**changes):
 
 
 RECORDED = hr.Recorded(samples=np.sin(np.arange(20000) * 0.1), rate=1e4, amplitude=1e-5, carriers=8)
+
+
+def on_users(device, parameters=None, **changes):
+    users = BaseDriver(**{"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1} | changes)
+    return opened(device, driver=users, **parameters or {})
+
+
 CHIRP = hr.Chirp(start=20.0, stop=400.0, duration=2.0, amplitude=5e-6)
 PARTS = hr.Scene(texture=TONE + CHIRP, duration=1.0).to_toml().replace("chirp", "chimp")
 TONE_TOML = 'duration = 1.0\n[texture]\nkind = "grating"\nfrequency = 50.0\namplitude = 1e-6\n'
@@ -134,11 +145,15 @@ FAINT = make_bands([500.0, 20.0, 20.0], [1e-12, 1e-6, 1e-12])
 MODEL = PlateParameters().device_model(5000.0, 1)
 IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
 HOT = {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3}
-MASSLESS = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_damping": 1.0}
+A_COLUMN = np.zeros((5, 1))
+SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_damping": 1.0}
+MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
+SCREEN = friction_tone(100.0)
+BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08), "finger": SLIDE}
+STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
-USERS = {"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1}
-BLIND = USERS | {"sensed_channels": 0}
+TO_CARRIER, SLOW = ("electroadhesion", {"output": "carrier"}), {"rate": 79_999, "sensed_channels": 0}
 TWO_TONES = hr.Grating(frequency=60.0, amplitude=1e-5, partials=((1.0, 1.0, 0.0), (2.4, 0.4, 1.0)))
 
 TEXTURES = [
@@ -234,7 +249,7 @@ TRACKER = [
     (lambda: hr.FingerTracker(3), "plate = 3: must be a PlateParameters or a Course"),
     (lambda: tracker().update(0.0, 0.0), r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"),
     (
-        lambda: tracker(rate=500).update(np.zeros((5, 1)), np.zeros((5, 2))),
+        lambda: tracker().update(A_COLUMN, np.zeros((5, 2))),
         r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)",
     ),
 ]
@@ -242,21 +257,18 @@ PLANTS = [
     (lambda: PlateParameters.with_overrides({"mass": 0.0}), r"mass = 0.0: must be .*> 0 .*kg"),
     (lambda: PlateParameters.with_overrides({"masss": 1.0}), r"masss = 1.0: unknown key; known: .*mass"),
     (lambda: PlateParameters(bending_frequency=6000.0), r"bending_frequency = 6000.0: must be <= rate = 5000 Hz"),
-    (
-        lambda: Plate(PlateParameters(), hr.Finger.still(normal_load=0.5, mechanics=MASSLESS)),
-        r"phalanx_mass = 0.0 kg: must be .*> 0",
-    ),
+    (lambda: Plate(PlateParameters(), MASSLESS), r"phalanx_mass = 0.0 kg: must be .*> 0"),
     (lambda: Plate(PlateParameters(delay=2), SLIDE, block=3), r"block = 3: must be between 1 and the loop's delay of"),
     (lambda: Plate(PlateParameters(), SLIDE).run(np.zeros((9, 1))), r"drive of shape \(9, 1\): must be \(samples, 2\)"),
     (lambda: least_model(hr.Scene(texture=TONE, duration=1.0), tolerance=0.0), "tolerance=0.0: must be > 0 and <= 10"),
     (lambda: UltrasonicParameters(rate=48e3), r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
     (
-        lambda: UltrasonicParameters(finger_damping=2000.0),
+        lambda: UltrasonicParameters(finger_damping=2e3),
         r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5",
     ),
     (
         lambda: UltrasonicParameters(**HOT),
-        r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
+        "temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
     ),
     (lambda: FitLaw(floor=1.0), r"floor = 1.0: must be .*<= 0.999"),
     (lambda: LoadSharing().ratio(1e-6, 0.0, 0.1), r"load = 0.0: must be .*> 0 .*N"),
@@ -269,33 +281,19 @@ SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
     (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
     (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
-    (
-        lambda: limited("vt-plate", peak=1.0),
-        "limits.peak = .*: unknown key; known: displacement, peak_drive, rms_drive",
-    ),
+    (lambda: limited("vt-plate", peak=1), "limits.peak = 1: unknown key; known: displacement, peak_drive, rms_drive"),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
     (lambda: plate(coils=3), "device.coils = 3: must be .* <= 2"),
     (lambda: opened("electroadhesion", finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.0"),
-    (
-        lambda: hr.prepare(friction_tone(100.0, force=2.0)),
-        r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal",
-    ),
-    (
-        lambda: hr.prepare(
-            hr.Scene(texture=TONE, finger=SLIDE, device="electroadhesion", duration=1.0, gradient=1.0),
-        ),
-        r"gradient = 1.0: must be 0 1/m",
-    ),
+    (lambda: hr.prepare(STRONG), "asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
+    (lambda: hr.prepare(replace(STRONG, gradient=1.0)), "gradient = 1.0: must be 0 1/m"),
     (lambda: opened("electroadhesion", force_range=1e-3), "friction of 0.3.. N: must be <= 0.001 N, the tribometer's"),
     (lambda: opened("electroadhesion", friction_coefficient=0.0), "device.friction_coefficient = 0.0: must be .* > 0"),
     (lambda: opened("ultrasonic", bias=0.1), r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
     (lambda: opened("ultrasonic", scale=1e-4), "asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
     (lambda: opened("ultrasonic", finger=hr.Finger.still(normal_load=0.4)), r"must slide faster than 0.001 m/s"),
     (lambda: opened("ultrasonic", finger=hr.Finger.absent()), r"must slide faster|normal_load = 0"),
-    (
-        lambda: opened("ultrasonic", hr.Grating(frequency=100.0, velocity=0.2)),
-        r"0.313 N of friction: must be <= 0.144 N",
-    ),
+    (lambda: opened("ultrasonic", FAST), "0.313 N of friction: must be <= 0.144 N"),
     *(
         (lambda device=device: opened(device, RECORDED, velocity_per_force=0.0), "must be > 0 .* for a recording")
         for device in ("electroadhesion", "ultrasonic")
@@ -340,25 +338,16 @@ DRIVERS = [
     (lambda: BoardClient("x", timeout=-1e-9), r"timeout = .*: must be a finite number >= 0 s"),
     (lambda: BoardClient("x", reconnect=np.inf), r"reconnect = .*: must be a finite number >= 0 s"),
     (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 100e3})),
-        r"driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz",
+        lambda: on_users("ultrasonic", rate=100e3),
+        "driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz",
     ),
+    (lambda: on_users("ultrasonic", rate=48e3, block=4), "rate = 48000.0: must be >= 66666.7 Hz for a carrier"),
+    (lambda: on_users("ultrasonic", {"sensor": "tribometer"}), "device.sensor = 'tribometer': must be 'amplitude'"),
     (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 48e3, "block": 4})),
-        r"rate = 48000.0: must be >= 66666.7 Hz for a carrier",
+        lambda: on_users(*TO_CARRIER, **SLOW),
+        "driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
     ),
-    (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS), sensor="tribometer"),
-        r"device.sensor = 'tribometer': must be 'amplitude'",
-    ),
-    (
-        lambda: opened("electroadhesion", driver=BaseDriver(**BLIND | {"rate": 79_999}), output="carrier"),
-        r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
-    ),
-    (
-        lambda: opened("electroadhesion", driver=BaseDriver(**USERS), output="carrier"),
-        r"driver.sensed_channels = 1: must be 0 where output = 'carrier'",
-    ),
+    (lambda: on_users(*TO_CARRIER), "driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
     (lambda: opened("hybrid", driver=driver(rate=10e3)), r"driver.drive_channels = 2: must be 3"),
 ]
 DESIGNS = [
@@ -368,10 +357,7 @@ DESIGNS = [
         (lambda method=method: played_late(method), "margin|unstable|sensitivity")
         for method in ("boxcar", "static", "stiffness", "resonant")
     ),
-    (
-        lambda: plate_controller(make_bands(47.0, 1e-6), delay=25, block=25).run(*map(np.zeros, ((30, 2), 30, 30))),
-        "30 samples: must be a multiple of the block of 25 samples",
-    ),
+    (lambda: in_blocks().run(*map(np.zeros, ((30, 2), 30, 30))), "30 samples: must be a multiple of the block of 25"),
     (lambda: demodulator(frequency=[]), "at least one number"),
     (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
     (lambda: demodulator(channels=0), "channels=0"),
@@ -380,15 +366,9 @@ DESIGNS = [
     (lambda: StarSTDFT(bandwidth=np.nan, rate=5000.0), "bandwidth=nan Hz must lie between"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
     (lambda: reduced_controller(-1.0, 5.0), "loop_bandwidth=-1.0 Hz: must be > 0 and below"),
-    (
-        lambda: exported(device="electroadhesion", texture=TONE, finger=SLIDE),
-        "device.kind = 'electroadhesion': a board plays vt-plate only",
-    ),
+    (lambda: board_design(hr.prepare(SCREEN), 0), "device.kind = 'electroadhesion': a board plays vt-plate only"),
     (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
-    (
-        lambda: exported(texture=hr.Synthetic(amplitude=20e-6, speed=0.08), finger=SLIDE),
-        "texture Synthetic: a board plays a whole waveform, without `carriers`",
-    ),
+    (lambda: exported(**BY_CARRIERS), "texture Synthetic: a board plays a whole waveform, without `carriers`"),
     (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),
     (lambda: exported(1), "bands = 1: must be 2 .* to 64"),
     (lambda: exported(65), "bands = 65: must be 2 .* to 64"),
