@@ -42,19 +42,9 @@ def test_a_friction_coefficient_other_than_assumed_is_corrected(method, block):
     assert band(recording)["rms_error_friction"] < NOISE
 
 
-class Untold(Screen):
-    """A screen that keeps the true friction to itself; or whose cable breaks at a sample."""
-
-    def __init__(self, breaks=None, **kind):
-        super().__init__(blind=False, **kind)
-        self.true, self.breaks = [], breaks
-
-    def _play(self, drive):
-        if self.breaks is not None and len(self.true) * self.block >= self.breaks:
-            raise hr.DeviceLost("screen: play: no answer")
-        played = super()._play(drive)
-        self.true.append(played.motion[:, 0])
-        return played._replace(motion=None)
+def untold(sample, sensed):
+    """The true friction is kept to oneself."""
+    return sensed._replace(motion=None)
 
 
 def shown_late(frequency, rate=RATE):
@@ -69,15 +59,15 @@ def shown_late(frequency, rate=RATE):
 @pytest.mark.parametrize(("frequency", "block"), [(100.0, 1), (300.0, 10)])
 def test_the_tribometers_delay_is_no_error_of_the_device(frequency, block):
     """Of which 100 Hz shows 10 and 300 Hz 31 %; the noise of 1 mN is its own error. Live as in `render`, to the end."""
-    scene, own = tone(frequency, duration=1.5), Untold(block=block)
+    scene, own = tone(frequency, duration=1.5), Screen(blind=False, block=block, tell=untold)
     recording = hr.render(scene, driver=own)
-    with hr.Player(scene, driver=Untold(block=block), paced=False) as player:
+    with hr.Player(scene, driver=Screen(blind=False, block=block, tell=untold), paced=False) as player:
         player.play(scene.texture)
         player.sleep(1.0)
         (live,) = player.state().bands
     assert recording.header.motion_source == "sensors"
     assert len(recording) == 1.5 * RATE
-    error = recording.motion[RATE // 2 :, 0] - np.concatenate(own.true)[RATE // 2 : len(recording)]
+    error = recording.motion[RATE // 2 :, 0] - np.concatenate(own.moved)[RATE // 2 : len(recording), 0]
     expected = np.hypot(shown_late(frequency) * FORCE / np.sqrt(2), 1e-3)
     assert error.std() < 1.05 * expected
     assert live.error < shown_late(frequency) + NOISE
@@ -85,8 +75,13 @@ def test_the_tribometers_delay_is_no_error_of_the_device(frequency, block):
 
 
 def test_no_sample_is_lost_where_the_tribometers_device_fails(tmp_path):
+    def breaks(sample, sensed):
+        if sample >= 5000:
+            raise hr.DeviceLost("screen: play: no answer")
+        return untold(sample, sensed)
+
     with pytest.raises(hr.DeviceLost):
-        hr.render(tone(100.0), driver=Untold(breaks=5000), journal=tmp_path / "cut.au")
+        hr.render(tone(100.0), driver=Screen(blind=False, tell=breaks), journal=tmp_path / "cut.au")
     assert len(hr.Recording.load(tmp_path / "cut.au")) == 5001  # and the one that is stopped
 
 

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from live_devices import Told
 from scipy.signal import hilbert
 from tables import scene_on
 from waves import phasor, read_back
 
 import hapticrender as hr
 from hapticrender.control.controller import BankController
-from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants.surface import SurfaceParameters
@@ -151,18 +151,9 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
     assert not recording.motion[away, 0].any()
 
 
-class Watched(SimulatedDriver):
-    """A resonant plate as a user's device: only the test gets its amplitude."""
-
-    def __init__(self, parameters, finger=SLIDE, block=1):
-        super().__init__(UltrasonicPlate(parameters, finger, block=block))
-        self.moved, self.played = [], []
-
-    def _play(self, drive):
-        sensed = super()._play(drive)
-        self.moved.append(sensed.motion[:, 0])
-        self.played.append(drive[:, 0].copy())
-        return sensed._replace(motion=None)
+def watched(finger=SLIDE, **tell):
+    """A resonant plate as a user's device, in blocks of 16: only the test gets its amplitude."""
+    return Told(UltrasonicPlate(UltrasonicParameters(delay=16), finger, block=16), **tell)
 
 
 def friction_of(moved, frequency, rate=192e3, load=0.4):
@@ -175,10 +166,10 @@ def friction_of(moved, frequency, rate=192e3, load=0.4):
 
 def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
     """A per cent in friction, with the lock on although it takes blocks."""
-    device = Watched(UltrasonicParameters(delay=16), block=16)
+    device = watched()
     session = prepare(scene(frequency=200.0, duration=0.42, settle=0.2), driver=device)
     recording = run(session)
-    assert friction_of(np.concatenate(device.moved), 200.0) == pytest.approx(WANTED, rel=PER_CENT)
+    assert friction_of(np.concatenate(device.moved)[:, 0], 200.0) == pytest.approx(WANTED, rel=PER_CENT)
     assert (session.driver.block, session.driver.delay) == (1, 1)
     shift = float(UltrasonicParameters().resonance(0.4)) - 30e3
     assert session.driver.loop.state["shift"][0] == pytest.approx(shift, abs=1.0)
