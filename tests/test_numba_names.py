@@ -3,6 +3,7 @@
 import ast
 from pathlib import Path
 
+from hapticrender import jit
 from hapticrender.control.kernel import error_step
 from hapticrender.jit import close_loop, digest
 
@@ -44,28 +45,21 @@ def bound_names(tree):
     return names
 
 
-def outside(source):
+def outside(tree, names):
     """All that a module takes from numba and llvmlite and that is not on the list."""
-    tree = ast.parse(source)
-    names = bound_names(tree)
     found = set(names.values()) - {"numba", "llvmlite", "numba.extending"} - ALLOWED
     for node in ast.walk(tree):
         first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
-        if first in names:
-            full = f"{names[first]}.{rest}"
-            if not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
-                found.add(full)
+        full = f"{names[first]}.{rest}" if first in names else ""
+        if full and not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
+            found.add(full)
         if isinstance(node, ast.FunctionDef | ast.Lambda) and any(each.arg == "builder" for each in node.args.args):
-            found |= set(handed_out(node))
-    return found | private_attributes(tree) | options(tree, names)
-
-
-def handed_out(function):
-    """Attributes of context, builder and signature in an intrinsic that are not on the list."""
-    for node in ast.walk(function):
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in IN_INTRINSICS:
-            if node.attr not in IN_INTRINSICS[node.value.id]:
-                yield f"{node.value.id}.{node.attr}"
+            handed = [each for each in ast.walk(node) if isinstance(each, ast.Attribute)]
+            owners = [(ast.unparse(each.value), each.attr) for each in handed]
+            found |= {f"{owner}.{name}" for owner, name in owners if name not in IN_INTRINSICS.get(owner, {name})}
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("numba.njit", "numba.cfunc", "njit", "cfunc"):
+            found |= {f"option {each.arg}" for each in node.keywords if each.arg and each.arg not in OPTIONS}
+    return found | private_attributes(tree)
 
 
 def private_attributes(tree):
@@ -79,30 +73,12 @@ def private_attributes(tree):
     }
 
 
-def options(tree, names):
-    """Options of njit and cfunc that are not on the list; those of `jit.OPTIONS` are in the dictionary of that name."""
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Call):
-            first, _, rest = ast.unparse(node.func).partition(".")
-            if f"{names.get(first, '')}{'.' if rest else ''}{rest}" in ("numba.njit", "numba.cfunc"):
-                found |= {f"option {each.arg}" for each in node.keywords if each.arg and each.arg not in OPTIONS}
-        elif isinstance(node, ast.AnnAssign | ast.Assign) and isinstance(node.value, ast.Dict):
-            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
-            if getattr(target, "id", "") == "OPTIONS":
-                found |= {f"option {key.value}" for key in node.value.keys} - {f"option {each}" for each in OPTIONS}
-    return found
-
-
-def uses_numba(source):
-    return bool(bound_names(ast.parse(source)))
-
-
 def test_shipped_code_uses_documented_names_only():
-    sources = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in SHIPPED}
-    users = {name: outside(source) for name, source in sources.items() if uses_numba(source)}
+    trees = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text(encoding="utf-8")) for path in SHIPPED}
+    users = {name: outside(tree, names) for name, tree in trees.items() if (names := bound_names(tree))}
     assert {"hapticrender/jit.py", "hapticrender/realtime_kernel.py", "hapticrender/control/kernel.py"} <= set(users)
     assert not {name: found for name, found in users.items() if found}
+    assert set(jit.OPTIONS) <= OPTIONS
 
 
 def test_cached_code_is_named_by_the_state_of_the_sources():
