@@ -38,8 +38,9 @@ def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
 def test_a_friction_coefficient_other_than_assumed_is_corrected(method, block):
     """A driver of the user's own, in blocks as well, whose finger has another mu than the scene's 0.8."""
     screen = Screen(blind=False, block=block, friction_coefficient=0.5)
-    recording = hr.render(tone(100.0, duration=2.0, finger=SLIDE), driver=screen, method=method)
-    assert band(recording)["rms_error_friction"] < NOISE
+    figures = band(hr.render(tone(100.0, duration=2.0, finger=SLIDE), driver=screen, method=method))
+    assert figures["target"] == pytest.approx(FORCE, rel=1e-6)
+    assert figures["rms_error_friction"] < NOISE
 
 
 def untold(sample, sensed):

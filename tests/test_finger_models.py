@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from finger_data import FREQUENCIES, make_impedance, make_record
+from finger_data import FREQUENCIES, make_impedance
 from scipy.stats import binom, chi2
 from subjects import population
 
 import hapticrender as hr
 from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
-from hapticrender.analysis.records import Impedance
+from hapticrender.analysis.records import LOADED, FingerRecord, Impedance, PlateTrack, Series
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
 
 DRAWS = {2: 200, 4: 40}
@@ -75,12 +75,17 @@ def test_errors_of_the_plate_are_not_averaged_over_windows():
     rng, w = np.random.default_rng(3), 2 * np.pi * FREQUENCIES
     errors = np.array([3e-5, 0.02, 10.0])  # kg, N s/m, N/m
     patterns = np.array([1j * w, w**0, 1 / (1j * w)])
-    record, pulls = make_record(rng, LIGHT_SECOND, plate_errors=errors[1:]), {"record": [], "impedance": []}
+    sides = zip(("damping", "stiffness"), errors[1:], strict=True)
+    stated = {f"{name}_{side}": np.full(6, each / np.sqrt(2)) for name, each in sides for side in (1, 2)}
+    nothing = Series(np.zeros(6), np.ones(6), 10.0)
+    touch = {"time": np.arange(6.0), "contact": np.full(6, LOADED), "normal_load": nothing, "position": nothing}
+    plate, pulls = PlateTrack(np.arange(6.0), {}, stated, True), {"record": [], "impedance": []}
+    touch |= {"velocity": nothing, "name": "", "segments": (), "plate": plate, "least_load": 0.1}
     for _ in range(60):
         z = make_impedance(rng, LIGHT_SECOND, 8, (0.1, 0.49), noise=0.02)
         stated = np.sqrt(z.standard_error**2 + errors**2 @ np.abs(patterns) ** 2 / 2)
         z = replace(z, value=z.value + (errors * rng.standard_normal(3)) @ patterns, standard_error=stated)
-        for name, measured in (("record", replace(record, impedance=z)), ("impedance", z)):
+        for name, measured in (("record", FingerRecord(**touch, impedance=z)), ("impedance", z)):
             fit = hr.fit_finger(measured, 2)
             truth = LIGHT_SECOND.load_factor(fit.mechanics.reference_load)
             parts = [(getattr(fit.mechanics, key) / getattr(LIGHT_SECOND, key) - truth) for key in fit.names[:3]]
