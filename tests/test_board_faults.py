@@ -2,18 +2,7 @@
 
 import numpy as np
 import pytest
-from board import (
-    RATE,
-    SANITISED,
-    Faults,
-    SteppedBoard,
-    client_of,
-    driven,
-    program_of,
-    run,
-    started,
-    tones,
-)
+from board import RATE, SANITISED, Faults, SteppedBoard, client_of, driven, program_of, run, started, tones
 from synthetic import make_bands
 
 from hapticrender.drivers import protocol

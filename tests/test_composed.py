@@ -83,8 +83,7 @@ def test_a_scene_file_holds_them(texture):
 
 
 @pytest.mark.parametrize(
-    ("device", "method"),
-    [("hybrid", "inverse"), *product(("vt-plate", "hybrid"), sorted(set(METHODS) - {"inverse"}))],
+    ("device", "method"), [("hybrid", "inverse"), *product(("vt-plate", "hybrid"), sorted(set(METHODS) - {"inverse"}))]
 )
 def test_methods_that_play_bands_refuse_a_whole_waveform(device, method):
     texture = hr.Recorded(samples=ARRAY.samples, rate=2000.0, amplitude=1e-6, speed=0.1)

@@ -96,8 +96,7 @@ def test_without_noise_it_is_exact_however_far_the_expected_plate_is():
 
 
 @pytest.mark.parametrize(
-    ("bending", "rate", "true"),
-    [((700.0, 30, 0.1), 4009.8, {}), ((1900.0, 50, -0.1), 5000.0, WRONG)],
+    ("bending", "rate", "true"), [((700.0, 30, 0.1), 4009.8, {}), ((1900.0, 50, -0.1), 5000.0, WRONG)]
 )
 def test_the_bending_mode_of_a_third_partys_plate_is_found(bending, rate, true):
     """m, I, k .05 %, b .2 %, delay .002 samples; f .5 Hz (1900 Hz: 1 Hz), damping 5 %, shape 5 % with its sign.

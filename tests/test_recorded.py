@@ -99,13 +99,7 @@ def test_a_gain_is_metres_per_full_scale_not_a_factor(write):
         Recorded(file=file, gain=0.021).check()
 
 
-SOUNDS = {
-    "b.wav": "DOUBLE",
-    "a.rf64": "FLOAT",
-    "a.aiff": "PCM_16",
-    "a.flac": "PCM_16",
-    "a.ogg": "VORBIS",
-}
+SOUNDS = {"b.wav": "DOUBLE", "a.rf64": "FLOAT", "a.aiff": "PCM_16", "a.flac": "PCM_16", "a.ogg": "VORBIS"}
 
 
 @pytest.mark.parametrize("name", SOUNDS)

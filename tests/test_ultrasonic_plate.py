@@ -59,12 +59,7 @@ def test_poles(load, pole, settling, quality):
 
 @pytest.mark.parametrize(
     ("load", "offset", "percent", "degrees", "digits"),
-    [
-        (0.0, 10.0, -0.9, 7.6, 1),
-        (0.0, 30.0, -7, 22, 0),
-        (0.0, 150.0, -55, 63, 0),
-        (0.5, 60.0, -3, 13, 0),
-    ],
+    [(0.0, 10.0, -0.9, 7.6, 1), (0.0, 30.0, -7, 22, 0), (0.0, 150.0, -55, 63, 0), (0.5, 60.0, -3, 13, 0)],
 )
 def test_what_detuning_costs(load, offset, percent, degrees, digits):
     """1/(1 + j 2 Q df/f) at Q 200 and Q 60, to the last printed digit."""
