@@ -114,8 +114,9 @@ class SteppedBoard:
     `damage(data)` returns what becomes of bytes on their way; before the time `pulled` all are lost.
     """
 
-    def __init__(self, program, folder, damage=lambda data: data, options=()):
-        self.program, self.folder, self.damage, self.options = program, folder, damage, options
+    def __init__(self, folder, *options, program=None):
+        self.program, self.folder, self.options = program or program_of(*SANITISED), folder, options
+        self.damage = lambda data: data
         self.time, self.pulled, self.connections, self.records = 0.0, 0.0, 0, []
         self._start()
 

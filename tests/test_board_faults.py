@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from board import RATE, SANITISED, Faults, SteppedBoard, driven, program_of, tones
+from board import RATE, Faults, SteppedBoard, driven, tones
 from synthetic import make_bands
 
 from hapticrender.drivers import protocol
@@ -13,7 +13,7 @@ from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverEr
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         yield board
 
 
@@ -78,7 +78,7 @@ def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
 
 def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
     """Noise of 1 um is 10 mm at a gain of 1e4; the range is 1 mm."""
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", "1e4,1")) as board:
+    with SteppedBoard(tmp_path, "--gain", "1e4,1") as board:
         client = board.client().open()
         with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
             client.identify([Line(0, 60.0, 0.05)], 1.0)
@@ -94,7 +94,7 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
     ],
 )
 def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", gains)) as board:
+    with SteppedBoard(tmp_path, "--gain", gains) as board:
         client = board.started(tones(72.0, amplitude=10e-6))
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             board.run(client, 2.0)
@@ -257,7 +257,7 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatc
     seconds = 120
     monkeypatch.setattr("secrets.randbelow", lambda most: int(rng.integers(most)))
     faults = Faults(18, 0.01)
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         session = Session(board, 18)
         board.damage = lambda data: session.recorded.append(data) or faults(data)
         session.play(seconds)

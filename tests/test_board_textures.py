@@ -46,7 +46,7 @@ def two_tones(time, position=None):
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+    with SteppedBoard(tmp_path, "--noise", "1e-8") as board:
         yield board
 
 
@@ -67,7 +67,7 @@ SMALL = "-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"
 def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, texture, sizes):
     """Under a finger that moves as the board says it did; sanitisers on; both plates have their own noise."""
     scene = replace(SCENE, texture=texture, duration=1.5)
-    with SteppedBoard(program_of(*SANITISED, *sizes), tmp_path, options=("--noise", "1e-7")) as board:
+    with SteppedBoard(tmp_path, "--noise", "1e-7", program=program_of(*SANITISED, *sizes)) as board:
         played = hr.render(scene, driver=board.driver(finger=FINGER))
     assert sensed_error(played) < 1.2 * sensed_error(simulated_as(played, scene, 1e-7))
     assert not played.read("flags").any()
@@ -168,7 +168,7 @@ def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
 
 
 def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+    with SteppedBoard(tmp_path, "--noise", "1e-8") as board:
         client = board.client(reconnect=5.0).open()
         client.set_bands(NO_BANDS, BoardTexture(Own(two_tones), client.capabilities, MODEL))
         client.start(stream=1)

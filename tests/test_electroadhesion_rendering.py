@@ -176,35 +176,19 @@ def test_a_moist_finger_is_flagged_and_played_open_loop():
     assert ratio < 0.15
 
 
-FAST = 192_000  # Hz
-FULL = 10e-3  # A
-
-
-def played(tmp_path, **plant):
-    """The recording of half a second of 100 Hz, the scene, and the file's samples (A) that belong to it."""
-    driver = WaveFileDriver(tmp_path / "carrier.wav", rate=FAST, drive_channels=1, full_scale=FULL, subtype="DOUBLE")
-    scene = tone(100.0, duration=0.5, output="carrier", **plant)
-    recording = hr.render(scene, driver=driver)
-    return recording, scene, read_back(driver.path, full_scale=driver.full_scale)[:, 0]
-
-
-def held(recording, scene):
-    """Envelope of the current (A) that the recorded drive asks for, at the file's rate."""
-    envelope = ElectroadhesionRenderer().read(scene, None).compensation(recording.drive[:, 0])
-    return np.repeat(envelope, round(FAST / recording.rate))
-
-
 def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
-    """Every sample is the envelope's times cos(2 pi k 5/48).
+    """Every sample is the envelope's times cos(2 pi k 5/48), over what the file's hold leaves of the carrier.
 
     A phase counted in doubles modulo a turn loses at most 2^-53 turns a block, 1e-12 rad in these 1000 blocks.
     """
-    recording, scene, file = played(tmp_path)
-    wanted = held(recording, scene)
+    full, droop = 10e-3, np.sinc(5 / 48)
+    driver = WaveFileDriver(tmp_path / "a.wav", rate=192_000, drive_channels=1, full_scale=full, subtype="DOUBLE")
+    scene = tone(100.0, duration=0.5, output="carrier")
+    recording = hr.render(scene, driver=driver)
+    file = read_back(driver.path, full_scale=full)[:, 0]
+    envelope = ElectroadhesionRenderer().read(scene, None).compensation(recording.drive[:, 0])
+    wanted = np.repeat(envelope, round(driver.rate / recording.rate))
     turns = np.array([float(Fraction(5 * k % 48, 48)) for k in range(48)])
     carrier = np.cos(2 * np.pi * np.resize(turns, len(wanted)))
-    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / DROOP, rtol=0, atol=1e-11 * FULL)
-    assert file[0] == pytest.approx(wanted[0] / DROOP)
-
-
-DROOP = np.sinc(5 / 48)  # of a carrier behind the file's hold: the driver makes up for it
+    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / droop, rtol=0, atol=1e-11 * full)
+    assert file[0] == pytest.approx(wanted[0] / droop)

@@ -1,7 +1,6 @@
 """Fits of finger models: their intervals cover the truth as often as they say, and the data choose the order."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,52 +18,23 @@ RARE = 1e-4  # probability of a false alarm of a bound
 FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
 
 
-def fitted(order):
-    """Fits of one order to many measurements of one finger, with the truth at each fit's own reference load."""
-    rng, finger = np.random.default_rng(order), FINGERS[order]
-    fits = [hr.fit_finger(make_impedance(rng, finger, 8, (0.1, 0.49), masked=0.1), order) for _ in range(DRAWS[order])]
-    growth = [finger.load_factor(fit.mechanics.reference_load) for fit in fits]
-    truth = {
-        name: np.full(len(fits), 1 / 3) if name == "load_exponent" else getattr(finger, name) * np.array(growth)
-        for name in fits[0].names
-    }
-    return SimpleNamespace(fits=fits, truth=truth, finger=finger, growth=growth)
-
-
 @pytest.mark.parametrize("order", [2, 4])
 def test_intervals_chi_square_and_errors_of_many_fits_are_those_stated(order):
-    """In one test, as every worker would make the fits anew."""
-    many = fitted(order)
-    for level in (0.683, 0.95):
-        check_intervals(many, level)
-    check_chi_square(many)
-    check_errors_of_impedance(many)
-
-
-def check_intervals(fitted, level):
-    """They cover the truth as often as they say."""
-    for name, truth in fitted.truth.items():
-        low, high = np.array([fit.interval(name, level) for fit in fitted.fits]).T
-        hits = int(((low <= truth) & (truth <= high)).sum())
-        assert binom.ppf(RARE, len(truth), level) <= hits <= binom.ppf(1 - RARE, len(truth), level), (name, hits)
-
-
-def check_chi_square(fitted):
-    """It is that of a model that explains the data."""
-    p = np.array([fit.p_value for fit in fitted.fits])
+    """Intervals cover the truth at each fit's own reference load as often as they say; p is that of a true model."""
+    rng, finger = np.random.default_rng(order), FINGERS[order]
+    fits = [hr.fit_finger(make_impedance(rng, finger, 8, (0.1, 0.49), masked=0.1), order) for _ in range(DRAWS[order])]
+    growth = np.array([finger.load_factor(fit.mechanics.reference_load) for fit in fits])
+    for name in fits[0].names:
+        truth = np.full(len(fits), 1 / 3) if name == "load_exponent" else getattr(finger, name) * growth
+        for level in (0.683, 0.95):
+            low, high = np.array([fit.interval(name, level) for fit in fits]).T
+            hits = int(((low <= truth) & (truth <= high)).sum())
+            assert binom.ppf(RARE, len(truth), level) <= hits <= binom.ppf(1 - RARE, len(truth), level), (name, hits)
+    p = np.array([fit.p_value for fit in fits])
     assert p.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(p)))  # p is uniform
-
-
-def check_errors_of_impedance(fitted):
-    """The predicted one is the measured one."""
     f = np.array([25.0, 150.0, 400.0])
-    off = np.array(
-        [
-            np.log(fit.impedance(f) / (growth * fitted.finger.impedance(f)))
-            for fit, growth in zip(fitted.fits, fitted.growth, strict=True)
-        ]
-    )
-    predicted = np.mean([fit.relative_error(f) for fit in fitted.fits], axis=0)
+    off = np.log([fit.impedance(f) / finger.impedance(f) for fit in fits]) - np.log(growth)[:, None]
+    predicted = np.mean([fit.relative_error(f) for fit in fits], axis=0)
     for part in (np.real, np.imag):  # ln |Z| and phase; the standard error of a deviation is 1/sqrt(2 n) of it
         measured = np.sqrt(np.mean(part(off) ** 2, axis=0))
         np.testing.assert_allclose(measured, part(predicted), rtol=4 / np.sqrt(2 * len(off)))

@@ -6,19 +6,7 @@ from dataclasses import replace
 import board
 import numpy as np
 import pytest
-from board import (
-    FINGER,
-    RATE,
-    ROOT,
-    SANITISED,
-    SCENE,
-    SteppedBoard,
-    build_board,
-    program_of,
-    sensed_error,
-    simulated_as,
-    tones,
-)
+from board import FINGER, RATE, ROOT, SCENE, SteppedBoard, build_board, program_of, sensed_error, simulated_as, tones
 
 import hapticrender as hr
 from hapticrender.cli import main
@@ -33,21 +21,21 @@ ROUNDING = 2.0**-24  # relative, of float32
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         yield board
 
 
 @pytest.fixture
 def fast(tmp_path):
     """The same without sanitisers."""
-    with SteppedBoard(program_of("-O2"), tmp_path) as board:
+    with SteppedBoard(tmp_path, program=program_of("-O2")) as board:
         yield board
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-7])
 def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, noise):
     """The board's own plate against the library's, under a finger that moves as the board says it did."""
-    with SteppedBoard(program_of("-O2"), tmp_path, options=("--noise", str(noise))) as board:
+    with SteppedBoard(tmp_path, "--noise", str(noise), program=program_of("-O2")) as board:
         played = hr.render(SCENE, driver=board.driver(finger=FINGER))
     simulated = simulated_as(played, SCENE, noise)
     on_board, in_library = sensed_error(played), sensed_error(simulated)
@@ -121,7 +109,7 @@ def test_refusals_name_port_command_and_bytes(stepped):
 def test_the_board_identifies_itself(tmp_path):
     """Drive as the lines say, and sensed what the device model makes of it."""
     lines = [Line(0, 60.0, 0.05), Line(1, 110.0, 0.05, 0.25)]
-    with SteppedBoard(program_of("-O2"), tmp_path, options=("--noise", "1e-8")) as board:
+    with SteppedBoard(tmp_path, "--noise", "1e-8", program=program_of("-O2")) as board:
         client = board.client().open()
         rows = client.identify(lines, 1.0)
         board.run(client, 0.1)
@@ -195,7 +183,7 @@ def test_nothing_there_and_nothing_that_answers(tmp_path):
 
 def test_more_bands_than_a_frame_holds(tmp_path):
     program = build_board(tmp_path / "firmware", hr.prepare(SCENE), "-O1", "-DREAL_DOUBLE", bands=20)
-    with SteppedBoard(program, tmp_path) as board:
+    with SteppedBoard(tmp_path, program=program) as board:
         client = board.client().open()
         client.set_bands(tones(*range(40, 340, 20), amplitude=1e-6))
         client.start()
