@@ -265,6 +265,7 @@ def test_a_bad_scene_gets_one_line_and_nothing_is_written(run, tiny, tmp_path, o
     assert not (tmp_path / "out").exists()
 
 
+PLATE = "other_plate:OtherPlate"
 BAD_ARGUMENTS = [
     (["render", "{tiny}", "--out", "{out}", "--method", "magic"], "--method = 'magic': must be one of paper, "),
     (["render", "{tiny}", "--out", "{tiny}/below"], "is a file, must be a folder"),
@@ -275,6 +276,12 @@ BAD_ARGUMENTS = [
     (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
+    (["latency", "--driver", "simulated"], "must be a device with a cable, such as audio:0"),
+    (["latency", "--driver", "wavefile:{out}.wav"], "senses nothing: a round trip needs an input"),
+    (["latency", "--driver", "audio:no such card"], "audio:"),
+    (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
+    (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
+    (["validate", "--suite", "accuracy", "--driver", PLATE], "--suite runs no scenes, on simulated devices"),
 ]
 
 

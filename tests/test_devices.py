@@ -105,10 +105,6 @@ def test_the_command_line_finds_a_driver_in_its_own_folder(tmp_path, monkeypatch
     assert cli.main(["render", "tone.toml", "--out", "out", "--driver", "bench:plate"]) == 0
     assert cli.main(["validate", "tone.toml", "tone.toml", "--driver", "bench:plate"]) == 0
     assert capsys.readouterr().out.count("within 10 %") == 2
-    assert cli.main(["validate", "tone.toml", "--driver", "bench:plate", "--jobs", "2"]) == 2
-    assert "must be 1 process where driver = 'bench:plate'" in capsys.readouterr().err
-    assert cli.main(["validate", "--suite", "accuracy", "--driver", "bench:plate"]) == 2
-    assert "--suite runs no scenes, on simulated devices" in capsys.readouterr().err
 
 
 def test_devices_shows_what_each_driver_finds(monkeypatch):

@@ -266,10 +266,6 @@ def test_what_cannot_be_identified_is_refused_before_anything_is_played(how, exp
         assert driver.played == []
 
 
-def at_3000(change):
-    return lambda sample, sensed: change(sensed) if sample == 3000 else sensed
-
-
 def lost(sensed):
     raise hr.DeviceLost("device: play: gone")
 
@@ -289,7 +285,7 @@ def lost(sensed):
     ids=["overrun", "saturated", "clipped", "lost"],
 )
 def test_a_fault_of_the_device_ends_at_zero_drive(change, error, message):
-    with OtherPlate(spoil=at_3000(change)) as driver:
+    with OtherPlate(spoil=lambda sample, sensed: change(sensed) if sample == 3000 else sensed) as driver:
         with pytest.raises(error, match=message):
             identify(driver, PAPER)
         assert not driver.played[-1].any()

@@ -44,10 +44,6 @@ def closed_loop(controller, low_pass):
     return above, below
 
 
-def times(controller, factor):
-    return TransferFunction(tuple(factor * np.array(controller.numerator)), controller.denominator)
-
-
 @EACH
 def test_figures_are_the_printed_ones(form):
     found = analyse(CONTROLLERS[form], L)
@@ -88,7 +84,8 @@ def test_gain_and_delay_margins_are_the_edges_of_stability(form):
     """The gain by the poles of the closed loop; the delay by Nyquist's count."""
     margins = loop_margins(CONTROLLERS[form] * L)
     for factor, stable in ((0.999, True), (1.001, False)):
-        louder = times(CONTROLLERS[form], factor * margins.gain)
+        plain = CONTROLLERS[form]
+        louder = TransferFunction(tuple(factor * margins.gain * np.array(plain.numerator)), plain.denominator)
         assert (np.roots(closed_loop(louder, L)[1]).real.max() < 0) == stable
         assert loop_margins(louder * L).stable is stable
         assert loop_margins(CONTROLLERS[form] * L, factor * margins.delay).stable is stable
