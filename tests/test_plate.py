@@ -157,15 +157,6 @@ def test_sensor_noise_is_white_and_as_strong_as_stated():
     assert np.all(abs(correlation) < 4 / np.sqrt(50_000))
 
 
-def test_loop_delay_is_the_stated_number_of_samples():
-    for delay, block in ((1, 1), (5, 1), (5, 5), (8, 4)):
-        plate = Plate(PlateParameters(delay=delay, **IDEAL), hr.Finger.absent(), block=block)
-        drive = np.zeros((40, 2))
-        drive[10] = 1.0
-        first = int(np.flatnonzero(plate.run(drive).motion[:, 0])[0])
-        assert first == 10 + (delay - block) + 1  # held during its interval, seen at the end of it
-
-
 def test_shape_is_that_of_a_free_bar():
     """Textbook numbers of the first free-free mode: middle -0.6078, nodes 0.2242 of the length from the ends."""
     plate = PlateParameters()

@@ -122,15 +122,6 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
         assert abs(error) > 5 * left  # so the comparison says something
 
 
-@pytest.mark.parametrize(("delay", "block"), [(1, 1), (4, 1), (4, 3)])
-def test_drive_acts_after_its_delay(delay, block):
-    plant = UltrasonicPlate(UltrasonicParameters(delay=delay, **IDEAL), FREE, block=block)
-    drive = np.zeros((12, 1))
-    drive[2] = 1.0
-    motion = plant.run(drive).motion[:, 0]
-    assert np.flatnonzero(motion)[0] == 2 + delay - block + 1
-
-
 def test_the_sensor_rounds_clips_and_has_its_noise():
     parameters = UltrasonicParameters(sensor_range=4e-6, sensor_bits=8, sensor_noise=0.0)
     drive = 10.0 * np.cos(2 * np.pi * 30e3 * np.arange(1500) / 192e3)[:, None]
