@@ -108,17 +108,13 @@ def test_the_command_line_finds_a_driver_in_its_own_folder(tmp_path, monkeypatch
 
 
 def test_devices_shows_what_each_driver_finds(monkeypatch):
-    class Broken(Calibrated):
-        @classmethod
-        def found(cls):
-            raise OSError("PortAudio library not found")
+    def finding(*found):
+        return type("Kind", (Calibrated,), {"found": lambda: [line() if callable(line) else line for line in found]})
 
-    class Empty(Calibrated):
-        @classmethod
-        def found(cls):
-            return []
+    def missing():
+        raise OSError("PortAudio library not found")
 
-    kinds = {"box": Calibrated, "card": Broken, "none": Empty, "plain": OtherPlate}
+    kinds = {"box": Calibrated, "card": finding(missing), "none": finding(), "plain": OtherPlate}
     points = [
         SimpleNamespace(name=name, value=f"there:{name}", group="hapticrender.drivers", load=lambda kind=kind: kind)
         for name, kind in kinds.items()

@@ -81,25 +81,19 @@ def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger(kind):
     assert set(found.uncertainty()) == set(found.profile())
 
 
-def test_what_cannot_be_identified_is_refused():
-    with pytest.raises(hr.DesignError, match="unexplained"):
-        identify_resonance(Resonator(force=0.0), SurfaceParameters())
-    with pytest.raises(hr.DesignError, match="must slide faster than 0.001 m/s"):
-        identify_screen(Screen(speed=0.0), ElectroadhesionParameters(), hr.Finger.absent())
-    with pytest.raises(hr.DesignError, match="identified open_loop_gain = -.*: must be a finite number > 0 N"):
-        identify_screen(Screen(gain=-1.5e4), ElectroadhesionParameters(), hr.Finger.absent())
-
-
 @pytest.mark.parametrize(
     ("device", "message"),
     [
+        (Resonator(force=0.0), "unexplained"),
+        (Screen(speed=0.0), "must slide faster than 0.001 m/s"),
+        (Screen(gain=-1.5e4), "identified open_loop_gain = -.*: must be a finite number > 0 N"),
         (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
         (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
         (Resonator(unit=1e6), r"sensed 1\.\d+ m: must be <= 2.5e-05 m, .* is it in m"),
         (Screen(unit=1e3), r"sensed \d+ N: must be <= 20 N, .* is it in N"),
     ],
 )
-def test_a_sensor_that_no_scene_can_use_is_refused(device, message):
+def test_what_cannot_be_identified_or_used_is_refused(device, message):
     screen = isinstance(device, Screen)
     arguments = (ElectroadhesionParameters(), hr.Finger.absent()) if screen else (SurfaceParameters(),)
     with pytest.raises(hr.DesignError, match=message):
