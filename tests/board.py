@@ -114,8 +114,9 @@ class SteppedBoard:
     `damage(data)` returns what becomes of bytes on their way; before the time `pulled` all are lost.
     """
 
-    def __init__(self, program, folder, damage=lambda data: data, options=()):
-        self.program, self.folder, self.damage, self.options = program, folder, damage, options
+    def __init__(self, folder, *options, program=None):
+        self.program, self.folder, self.options = program or program_of(*SANITISED), folder, options
+        self.damage = lambda data: data
         self.time, self.pulled, self.connections, self.records = 0.0, 0.0, 0, []
         self._start()
 
@@ -184,6 +185,26 @@ class SteppedBoard:
         self.sleep(0.001)
         assert driven(self.board.log(), self.sample - 1, self.sample) == []
 
+    def client(self, **options):
+        return BoardClient("stepped", background=False, clock=self, connect=self.connect, **options)
+
+    def driver(self, **options):
+        return SerialDriver("stepped", background=False, clock=self, connect=self.connect, **options)
+
+    def started(self, bands=None, seconds=0.0, **options):
+        """Client whose board has played bands for some time; a tone of 47 Hz where none are given."""
+        client = self.client(**options).open()
+        client.set_bands(bands or tones(47.0))
+        client.start()
+        self.run(client, seconds)
+        return client
+
+    def run(self, client, seconds):
+        end = self.time + seconds
+        while self.time < end:
+            client.step()
+            self.sleep(0.005)
+
     def inject(self, data):
         """Put bytes on the line to the board."""
         self._waiting += data
@@ -212,23 +233,6 @@ class Faults:
         return b"".join(pieces)
 
 
-def client_of(board, **options):
-    return BoardClient("stepped", background=False, clock=board, connect=board.connect, **options)
-
-
-def started(board, bands=None, seconds=0.0, **options):
-    """Client whose board has played bands for some time; a tone of 47 Hz where none are given."""
-    client = client_of(board, **options).open()
-    client.set_bands(bands or tones(47.0))
-    client.start()
-    run(client, board, seconds)
-    return client
-
-
-def driver_of(board, **options):
-    return SerialDriver("stepped", background=False, clock=board, connect=board.connect, **options)
-
-
 def tones(*frequencies, amplitude=5e-6):
     return make_bands(frequencies, amplitude)
 
@@ -248,13 +252,6 @@ def sensed_error(recording, start=int(0.3 * RATE)):
     frequency = np.fft.rfftfreq(len(reference), 1 / RATE)
     inside = (frequency >= 20) & (frequency <= 500)
     return np.linalg.norm(error[inside]) / np.linalg.norm(np.fft.rfft(reference)[inside])
-
-
-def run(client, board, seconds):
-    end = board.monotonic() + seconds
-    while board.monotonic() < end:
-        client.step()
-        board.sleep(0.005)
 
 
 def driven(log, start, stop):

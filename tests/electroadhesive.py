@@ -1,10 +1,10 @@
 """Scenes and devices that the tests of electroadhesion share."""
 
 import numpy as np
+from live_devices import Told
 from tables import scene_on
 
 import hapticrender as hr
-from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 
 RATE, SPEED, MU = 10_000, 0.05, 0.8
@@ -18,19 +18,13 @@ def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):
     return scene_on("electroadhesion", texture, finger, duration, keep_unfelt=True, **plant)
 
 
-class Screen(SimulatedDriver):
+class Screen(Told):
     """A screen of the user's own: it takes the envelope, in blocks, and shows friction or, blind, nothing."""
 
-    def __init__(self, *, blind=True, block=1, finger=SLIDE, **parameters):
-        super().__init__(ElectroadhesionScreen(ElectroadhesionParameters(**parameters), finger, seed=1))
+    def __init__(self, *, blind=True, block=1, finger=SLIDE, tell=lambda sample, sensed: sensed, **parameters):
+        super().__init__(ElectroadhesionScreen(ElectroadhesionParameters(**parameters), finger, seed=1), tell)
         self.block = self.delay = block
-        self.attraction = []  # N, block by block
         self.sensed_channels = 0 if blind else 1
-
-    def _play(self, drive):
-        played = super()._play(drive)
-        self.attraction.append(self.plant.motion[:, 1])
-        return played if self.sensed_channels else played._replace(sensed=np.zeros((len(drive), 0)))
 
 
 def band(recording):

@@ -91,6 +91,23 @@ class Calling(Bench):
         return hr.Sensed(self.plate.run(drive).sensed)
 
 
+class Told(SimulatedDriver):
+    """A plant as a device of the user's own, which hands over `tell(sample, sensed)`, and its motion to nobody else.
+
+    It keeps what it plays (`played`) and how it really moves (`moved`), block by block.
+    """
+
+    def __init__(self, plant, tell=lambda sample, sensed: sensed._replace(motion=None)):
+        super().__init__(plant)
+        self.tell, self.played, self.moved = tell, [], []
+
+    def _play(self, drive):
+        sample, sensed = self.block * len(self.played), super()._play(drive)
+        self.played.append(drive.copy())
+        self.moved.append(sensed.motion)
+        return self.tell(sample, sensed._replace(sensed=sensed.sensed[:, : self.sensed_channels]))
+
+
 class Blind(SimulatedDriver):
     """A plate that senses no finger."""
 

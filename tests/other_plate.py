@@ -36,25 +36,38 @@ class OtherPlate:
         self.spoil, self.delay, self.block = wiring.pop("spoil", None), wiring.pop("told", 1), wiring.pop("block", 1)
         if wiring:
             raise TypeError(f"unknown {wiring}")
-        arms = np.array([[1.0, -SPACING / 2], [1.0, SPACING / 2]])  # sides from [x_c, theta]
-        touch = np.array([1.0, position])
-        mass, damping, stiffness = finger or (0.0, 0.0, 0.0)
-        m = np.diag([truth["mass"], truth["inertia"]]) + mass * np.outer(touch, touch)
-        c = arms.T @ np.diag([truth["damping_1"], truth["damping_2"]]) @ arms + damping * np.outer(touch, touch)
-        k = arms.T @ np.diag([truth["stiffness_1"], truth["stiffness_2"]]) @ arms + stiffness * np.outer(touch, touch)
-        flow = np.zeros((7, 7))
-        flow[:2, 2:4] = np.eye(2)
-        flow[2:4] = np.linalg.solve(m, np.hstack([-k, -c, FORCE_CONSTANT * arms.T, -load * touch[:, None]]))
-        step = expm(flow / rate)
-        self._phi, self._gamma, self._push = step[:4, :4], step[:4, 4:6] @ self.coils, step[:4, 6]
-        ends = np.array([[1.0, -REACH, 0.0, 0.0], [1.0, REACH, 0.0, 0.0]])
-        self._show = self.sensors @ np.diag(truth["gains"]) @ ends
-        self._state = np.zeros(4)
-        if load:
-            self._state = np.linalg.solve(np.eye(4) - self._phi, self._push)
+        self.fingers = [(finger or (0.0, 0.0, 0.0), position, load)]
+        self._design([True])
+        self._show = self.sensors @ np.diag(truth["gains"]) @ [[1.0, -REACH], [1.0, REACH]]
+        self._state = np.linalg.solve(np.eye(len(self._phi)) - self._phi, self._push)
         self._queue = [np.zeros(2)] * (truth["delay"] - self.block)
         self._rng = np.random.default_rng(seed)
         self.played, self.is_open = [], False
+
+    def _design(self, touching):
+        """Step over a sample with held currents while some of the fingers (mechanics, position m, load N) touch.
+
+        q = [x_c, theta, phalanges]; mechanics are m, b, k, and those of a phalanx where there is one.
+        """
+        n, truth = 2 + len(self.fingers), self.truth
+        arms = np.pad([[1.0, -SPACING / 2], [1.0, SPACING / 2]], ((0, 0), (0, n - 2)))  # sides
+        m, push = np.diag([truth["mass"], truth["inertia"], *[1.0] * (n - 2)]), np.zeros(n)
+        c = arms.T @ np.diag([truth["damping_1"], truth["damping_2"]]) @ arms
+        k = arms.T @ np.diag([truth["stiffness_1"], truth["stiffness_2"]]) @ arms
+        for i, ((mass, damping, stiffness, *phalanx), place, load) in enumerate(self.fingers, 2):
+            m[i, i], c[i, i], k[i, i] = phalanx or (1.0, 0.0, 1.0)
+            glass = np.eye(n)[0] + place * np.eye(n)[1]
+            skin = glass - (np.eye(n)[i] if phalanx else 0.0)
+            if touching[i - 2]:
+                m += mass * np.outer(glass, glass)
+                c += damping * np.outer(skin, skin)
+                k += stiffness * np.outer(skin, skin)
+                push -= load * glass
+        flow = np.zeros((2 * n + 3, 2 * n + 3))
+        flow[:n, n : 2 * n] = np.eye(n)
+        flow[n : 2 * n] = np.linalg.solve(m, np.hstack([-k, -c, FORCE_CONSTANT * arms.T, push[:, None]]))
+        step = expm(flow / self.rate)[: 2 * n]
+        self._phi, self._gamma, self._push = step[:, : 2 * n], step[:, 2 * n : -1] @ self.coils, step[:, -1]
 
     def __enter__(self):
         self.is_open = True
@@ -66,7 +79,7 @@ class OtherPlate:
     def play(self, drive):
         sensed = np.empty((self.block, 2))
         for i, row in enumerate(drive):
-            sensed[i] = self._show @ self._state
+            sensed[i] = self._show @ self._state[:2]
             self._queue.append(row)
             self._state = self._phi @ self._state + self._gamma @ self._queue.pop(0) + self._push
         self.played.append(drive.copy())

@@ -196,30 +196,6 @@ def test_ideal_sensors_are_no_exception(bits):
     assert np.abs(found.normal_load.value[at] / glass_force(subject, recording, len(found.time))[at] - 1).max() < 0.005
 
 
-def test_what_is_no_recording_of_such_a_plate_is_refused(studied):
-    _, recording, _ = studied[0]
-    for change, message in (
-        ({"sensed_channels": 1}, r"1 sensors in m: must be 2 in m"),
-        ({"unit": "N"}, r"2 sensors in N: must be 2 in m"),
-        ({"drive_channels": 1}, r"1 drive channels: must be 2, one a coil"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            hr.analyse_finger(hr.Recording(replace(recording.header, **change), recording.frames, recording.scene))
-    short, other = (
-        hr.Recording(recording.header, recording.frames[:4999], recording.scene),
-        hr.DeviceProfile(kind="ultrasonic"),
-    )
-    for error, message, arguments in (
-        (ValueError, r"0.9998 s long: must be >= 1 s", {"recording": short}),
-        (ValueError, r"profile.kind = 'ultrasonic': must be vt-plate", {"profile": other}),
-        (TypeError, r"profile = 3: must be a DeviceProfile, PlateParameters, the path of", {"profile": 3}),
-        (TypeError, r"recording = '/a.h5': must be a Recording: see Recording.load", {"recording": "/a.h5"}),
-        (ValueError, r"block=2 samples: must be an integer from 1 to the plate's delay, 1", {"block": 2}),
-    ):
-        with pytest.raises(error, match=message):
-            hr.analyse_finger(**{"recording": recording} | arguments)
-
-
 def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):
     """100 ms without samples, as live play marks them, under a finger: no other touch, no window there, and a note."""
     subject, recording, found = studied[0]

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
-from hapticrender.cli import main
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.audio_callback import AHEAD, LOST, SLOTS, BlockQueue, Relay
@@ -296,12 +295,3 @@ def test_the_delay_is_written_into_a_profile(tmp_path):
     write_delay(path, found)
     expected = {"sensed_per_full_scale": 1e-3, "delay": 143.5}
     assert tomllib.loads(path.read_text()) == tomllib.loads(before) | {"calibration": expected}
-
-
-def test_the_verb_refuses_what_has_no_cable(capsys, tmp_path):
-    assert main(["latency", "--driver", "simulated"]) == 2
-    assert "must be a device with a cable, such as audio:0" in capsys.readouterr().err
-    assert main(["latency", "--driver", f"wavefile:{tmp_path / 'drive.wav'}"]) == 2
-    assert "senses nothing: a round trip needs an input" in capsys.readouterr().err
-    assert main(["latency", "--driver", "audio:no such card"]) == 2
-    assert "audio:" in capsys.readouterr().err

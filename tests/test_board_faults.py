@@ -2,18 +2,7 @@
 
 import numpy as np
 import pytest
-from board import (
-    RATE,
-    SANITISED,
-    Faults,
-    SteppedBoard,
-    client_of,
-    driven,
-    program_of,
-    run,
-    started,
-    tones,
-)
+from board import RATE, Faults, SteppedBoard, driven, tones
 from synthetic import make_bands
 
 from hapticrender.drivers import protocol
@@ -24,16 +13,16 @@ from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverEr
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         yield board
 
 
 def test_a_board_that_stays_away_is_lost(stepped):
-    client = started(stepped, seconds=0.1, reconnect=1.0)
+    client = stepped.started(seconds=0.1, reconnect=1.0)
     stepped.pulled = np.inf
     start = stepped.time
     with pytest.raises(DeviceLost, match=r"stepped: listen: no valid frame for 0.5 s \(\d+ bytes sent"):
-        run(client, stepped, 10.0)
+        stepped.run(client, 10.0)
     # silence for 0.5 s, 1 s of attempts, the last of which may take 1 s and 0.05 s
     assert 1.5 <= stepped.time - start <= 2.56
     with pytest.raises(DeviceLost, match="no valid frame"):
@@ -42,7 +31,7 @@ def test_a_board_that_stays_away_is_lost(stepped):
 
 def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     """No word for 100 ms of the board's clock: the host's process is stopped, so nothing else can say so."""
-    client = started(stepped, seconds=0.5)
+    client = stepped.started(seconds=0.5)
     last = stepped.sample
     stepped.sleep(0.3)
     (silent,) = [int(line[0]) for line in stepped.board.log() if line[1:3] == ["state", "0"]]
@@ -50,47 +39,47 @@ def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     assert stepped.board.log()[-1][1:] == ["drives", "0"]
     assert int(stepped.board.log()[-1][0]) <= last + 0.100 * RATE
     with pytest.raises(DeviceLost, match="the board received no valid frame for 80 ms, and stopped"):
-        run(client, stepped, 0.1)
+        stepped.run(client, 0.1)
 
 
 def test_a_finger_that_is_not_heard_of_is_lifted(stepped):
-    client = client_of(stepped).open()
+    client = stepped.client().open()
     client.set_bands(tones(47.0))
     client.start(telemetry=0.001)
     client.finger(0.0, 0.1)
-    run(client, stepped, 0.1)
+    stepped.run(client, 0.1)
     assert client.telemetry().position == pytest.approx(0.1 * 0.05, abs=0.1 * 0.002)  # followed for 50 ms
-    run(client, stepped, 0.08)
+    stepped.run(client, 0.08)
     assert client.telemetry().position == pytest.approx(0.1 * 0.05, abs=0.1 * 0.002)
-    run(client, stepped, 0.04)
+    stepped.run(client, 0.04)
     assert np.isnan(client.telemetry().position)
     client.finger(np.nan)
-    run(client, stepped, 0.02)
+    stepped.run(client, 0.02)
     client.finger(0.03)
-    run(client, stepped, 0.02)
+    stepped.run(client, 0.02)
     assert client.telemetry().position == pytest.approx(0.03, rel=1e-6)  # a touch is no glide
 
 
 def test_limits_stop_the_board(stepped):
-    client = started(stepped, tones(20.0, amplitude=30e-6), seconds=0.5)
+    client = stepped.started(tones(20.0, amplitude=30e-6), seconds=0.5)
     client.limits(0.5, 0.05, 0.1)
     with pytest.raises(DeviceFault, match="the board stopped: the mean square of the drive is above its limit"):
-        run(client, stepped, 1.0)
+        stepped.run(client, 1.0)
 
 
 def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there."""
-    client = started(stepped)
+    client = stepped.started()
     client.finger(0.055, 0.0, 20.0)
     with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
-        run(client, stepped, 0.2)
+        stepped.run(client, 0.2)
     stepped.assert_at_rest()
 
 
 def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
     """Noise of 1 um is 10 mm at a gain of 1e4; the range is 1 mm."""
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", "1e4,1")) as board:
-        client = client_of(board).open()
+    with SteppedBoard(tmp_path, "--gain", "1e4,1") as board:
+        client = board.client().open()
         with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
             client.identify([Line(0, 60.0, 0.05)], 1.0)
         board.assert_at_rest()
@@ -105,16 +94,16 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
     ],
 )
 def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--gain", gains)) as board:
-        client = started(board, tones(72.0, amplitude=10e-6))
+    with SteppedBoard(tmp_path, "--gain", gains) as board:
+        client = board.started(tones(72.0, amplitude=10e-6))
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
-            run(client, board, 2.0)
+            board.run(client, 2.0)
         assert client._line.telemetry.cause in causes
         board.assert_at_rest()
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):
-    started(stepped, seconds=0.2)
+    stepped.started(seconds=0.2)
     last = stepped.sample
     for _ in range(20):
         stepped.inject(bytes(rng.integers(0, 256, 200, dtype="u1")))
@@ -125,7 +114,7 @@ def test_garbage_is_no_sign_of_life(stepped, rng):
 @pytest.mark.parametrize(("late", "stops"), [(0.07, False), (0.09, True)])
 def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
     """A line that fills up: words come every 15 ms, each 5 ms later than the one before, until they are `late` old."""
-    client = started(stepped, seconds=0.2)
+    client = stepped.started(seconds=0.2)
     start, waiting = stepped.time, []
     while stepped.time < start + 0.6:
         arrival = stepped.time + min(late, (stepped.time - start) / 2)
@@ -138,7 +127,7 @@ def test_a_word_that_waited_for_long_is_no_sign_of_life(stepped, late, stops):
 
 def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     """Commands with a number changed and the CRC-16 made anew: what one in 65 536 damaged frames amounts to."""
-    client = started(stepped, seconds=0.2)
+    client = stepped.started(seconds=0.2)
     before, refused = stepped.board.log(), client.telemetry().refused
     link = client._line
     words = [
@@ -153,9 +142,9 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
         )
         changed = bytes([frame.payload[0] ^ 1]) + frame.payload[1:]
         stepped.inject(protocol.encode(frame._replace(payload=changed)))
-        run(client, stepped, 0.02)
+        stepped.run(client, 0.02)
     client._line._foreign = 0
-    run(client, stepped, 0.1)
+    stepped.run(client, 0.1)
     assert client.telemetry().refused == refused + len(words)
     assert client.telemetry().commits == 1
     assert np.isnan(client.telemetry().position)
@@ -164,7 +153,7 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
 
 def test_a_commit_acts_only_on_what_it_says(stepped):
     """A set-point that never came leaves the one from before in its place: the digest shows it."""
-    client = client_of(stepped).open()
+    client = stepped.client().open()
     client.set_bands(tones(47.0, 72.0))
     payloads = [protocol.pack(Kind.SETPOINT, index, 100.0 + 20 * index, 0.0, 0.0, 5e-6, 0.0) for index in (0, 1)]
     client._line.send(Kind.SETPOINT, payloads[1])
@@ -181,18 +170,18 @@ def test_doubled_and_recorded_commands_do_nothing(stepped):
     def play(client):
         client.set_bands(tones(47.0))
         client.start()
-        run(client, stepped, 0.2)
+        stepped.run(client, 0.2)
 
-    with client_of(stepped) as client:
+    with stepped.client() as client:
         play(client)
         client.stop()
-        run(client, stepped, 0.1)
+        stepped.run(client, 0.1)
         stepped.damage = lambda data: data
         before = len(stepped.board.log())
         replay(stepped, recorded)
-        run(client, stepped, 0.1)
+        stepped.run(client, 0.1)
         assert len(stepped.board.log()) == before
-    with client_of(stepped) as client:
+    with stepped.client() as client:
         play(client)
         before = stepped.board.log()
         replay(stepped, recorded)
@@ -201,7 +190,7 @@ def test_doubled_and_recorded_commands_do_nothing(stepped):
         assert after == [["state", "0", str(int(Cause.SESSION))]]
         assert driven(stepped.board.log(), stepped.sample - 1, stepped.sample) == []
         with pytest.raises(DeviceLost, match="session: the board has another session"):
-            run(client, stepped, 1.0)
+            stepped.run(client, 1.0)
 
 
 def replay(board, recorded):
@@ -215,7 +204,7 @@ class Session:
 
     def __init__(self, board, seed):
         self.board, self.rng = board, np.random.default_rng(seed)
-        self.client = client_of(board, reconnect=10.0)
+        self.client = board.client(reconnect=10.0)
         self.asked, self.gains, self.silences = [], [1.0], []
         self.recorded = []
 
@@ -241,7 +230,7 @@ class Session:
         start = self.board.sample
         self.silences.append((len(self.board.records), start, start + duration * RATE))
         self.board.pulled = self.board.time + duration
-        run(self.client, self.board, duration)
+        self.board.run(self.client, duration)
 
     def play(self, seconds):
         client, board, rng = self.client, self.board, self.rng
@@ -251,7 +240,7 @@ class Session:
             changes = [self.change, self.change_gain, self.flood, self.pull, board.reset]
             while board.monotonic() < seconds:
                 client.finger(rng.uniform(-0.02, 0.02), rng.uniform(-0.1, 0.1), 0.4)
-                run(client, board, rng.uniform(0.05, 0.5))
+                board.run(client, rng.uniform(0.05, 0.5))
                 attempt(rng.choice(changes, p=[0.5, 0.25, 0.15, 0.05, 0.05]))
 
 
@@ -268,7 +257,7 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatc
     seconds = 120
     monkeypatch.setattr("secrets.randbelow", lambda most: int(rng.integers(most)))
     faults = Faults(18, 0.01)
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         session = Session(board, 18)
         board.damage = lambda data: session.recorded.append(data) or faults(data)
         session.play(seconds)

@@ -13,10 +13,7 @@ from board import (
     SCENE,
     Faults,
     SteppedBoard,
-    client_of,
-    driver_of,
     program_of,
-    run,
     sensed_error,
     simulated_as,
     tones,
@@ -49,7 +46,7 @@ def two_tones(time, position=None):
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
+    with SteppedBoard(tmp_path, "--noise", "1e-8") as board:
         yield board
 
 
@@ -70,15 +67,15 @@ SMALL = "-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"
 def test_a_recording_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, texture, sizes):
     """Under a finger that moves as the board says it did; sanitisers on; both plates have their own noise."""
     scene = replace(SCENE, texture=texture, duration=1.5)
-    with SteppedBoard(program_of(*SANITISED, *sizes), tmp_path, options=("--noise", "1e-7")) as board:
-        played = hr.render(scene, driver=driver_of(board, finger=FINGER))
+    with SteppedBoard(tmp_path, "--noise", "1e-7", program=program_of(*SANITISED, *sizes)) as board:
+        played = hr.render(scene, driver=board.driver(finger=FINGER))
     assert sensed_error(played) < 1.2 * sensed_error(simulated_as(played, scene, 1e-7))
     assert not played.read("flags").any()
 
 
 def streaming(board, texture):
     """Client whose board plays a texture and streams every sample."""
-    client = client_of(board).open()
+    client = board.client().open()
     found = BoardTexture(texture, client.capabilities, MODEL)
     client.set_bands(NO_BANDS, found)
     client.start(stream=1)
@@ -92,12 +89,12 @@ def motion_of(rows):
 def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
     """The host sends nothing for a second, half a second more than it had sent ahead, then goes on."""
     client, texture = streaming(stepped, Own(two_tones))
-    run(client, stepped, 0.4)
+    stepped.run(client, 0.4)
     texture.samples, samples = lambda played: None, texture.samples
     last = texture.written
-    run(client, stepped, 1.0)
+    stepped.run(client, 1.0)
     texture.samples = samples
-    run(client, stepped, 1.2)
+    stepped.run(client, 1.2)
     rows = client.rows(int(2.5 * RATE))
     n = np.arange(len(rows))
     ahead, fade = client.capabilities.lookahead, 0.04 * RATE
@@ -158,9 +155,9 @@ def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
     """1 byte of 1000, 14 % of the frames of samples; what is sent again may come too late, which is flagged."""
     client, _ = streaming(stepped, Own(two_tones))
     stepped.damage = Faults(11, 0.001)
-    run(client, stepped, 3.0)
+    stepped.run(client, 3.0)
     stepped.damage = lambda data: data
-    run(client, stepped, 0.1)
+    stepped.run(client, 0.1)
     rows = client.rows(int(2.9 * RATE))
     whole = (rows[:, -1] == 0.0) & (np.arange(len(rows)) > 0.3 * RATE)
     expected = two_tones(np.arange(len(rows)) / RATE)
@@ -171,15 +168,15 @@ def test_a_line_that_damages_bytes_plays_no_other_sample(stepped):
 
 
 def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path, options=("--noise", "1e-8")) as board:
-        client = client_of(board, reconnect=5.0).open()
+    with SteppedBoard(tmp_path, "--noise", "1e-8") as board:
+        client = board.client(reconnect=5.0).open()
         client.set_bands(NO_BANDS, BoardTexture(Own(two_tones), client.capabilities, MODEL))
         client.start(stream=1)
-        run(client, board, 0.2)
+        board.run(client, 0.2)
         board.reset()
         while not client.reconnections:
-            run(client, board, 0.01)
-        run(client, board, 1.0)
+            board.run(client, 0.01)
+        board.run(client, 1.0)
         rows = client.rows()
     begins = np.flatnonzero(rows[:, -1].astype(int) & hr.Flag.OVERRUN)[0]  # some before it are lost
     assert 0.15 * RATE < begins < 0.25 * RATE
@@ -192,9 +189,9 @@ def test_a_board_that_was_reset_begins_its_texture_anew(tmp_path):
 
 def test_what_the_samples_take_of_the_line_is_what_the_page_says(stepped):
     client, _ = streaming(stepped, hr.Recorded(**RECORDED))
-    run(client, stepped, 0.2)
+    stepped.run(client, 0.2)
     before = client._line.sent_bytes
-    run(client, stepped, 2.0)
+    stepped.run(client, 2.0)
     # a frame more or less in two seconds; signs of life come up to 1 ms late, as a command is waited for in between
     assert (client._line.sent_bytes - before) / 2.0 - 1900 == pytest.approx(11_600, abs=74 + 0.1 * 1900)
     assert "| 11 600 |" in (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -214,7 +211,7 @@ def test_textures_fade_into_each_other(stepped):
         change()
         for _ in range(8):
             client.finger(0.0005, 0.0, 0.4)  # a quarter of the wavelength
-            run(client, stepped, 0.05)
+            stepped.run(client, 0.05)
     rows = client.rows(int(1.5 * RATE))
     # tones up to 100 Hz of 8 um: 1 um a sample, its half for what the sum of two fading textures adds
     assert abs(np.diff(motion_of(rows)))[int(0.2 * RATE) :].max() < 1.5e-6
@@ -225,7 +222,7 @@ def test_textures_fade_into_each_other(stepped):
 
 def test_a_table_is_as_fine_as_it_has_to_be(stepped):
     """Cubic interpolation at x = 0.382 between points of distance h has the response sum w_j e^(i k h (j - x))."""
-    found = client_of(stepped).open().capabilities
+    found = stepped.client().open().capabilities
     reach = 0.055 + 2e-3  # of the plate's glass
     places, x = np.arange(-1, 3), 0.382
     weights = np.array([np.prod([(x - other) / (own - other) for other in places if other != own]) for own in places])
@@ -241,10 +238,10 @@ def test_a_table_is_as_fine_as_it_has_to_be(stepped):
 def test_a_force_and_carriers_are_refused(stepped):
     screen = replace(SCENE, texture=hr.Grating(velocity=8e-3, frequency=80.0), device="electroadhesion")
     with pytest.raises(ValueError, match=r"device = 'electroadhesion': .*has the law of 'vt-plate' on it, and plays"):
-        hr.render(screen, driver=driver_of(stepped))
+        hr.render(screen, driver=stepped.driver())
     scene = replace(SCENE, texture=hr.Recorded(**RECORDED, carriers=4), duration=0.1)
     with pytest.raises(ValueError, match="carriers = 4: must be left out on a board"):
-        hr.render(scene, driver=driver_of(stepped))
+        hr.render(scene, driver=stepped.driver())
 
 
 @pytest.mark.parametrize(("beats", "stops"), [(True, False), (False, True)])
@@ -252,14 +249,14 @@ def test_the_board_stops_without_a_beat_of_the_application(stepped, beats, stops
     """The service goes on: fingers and signs of life, but none of them from the application."""
     client, _ = streaming(stepped, Own(two_tones))
     client.watch(0.1)
-    run(client, stepped, 0.02)
+    stepped.run(client, 0.02)
     start = stepped.sample
     with pytest.raises(WatchdogTimeout) if stops else nullcontext():
         for _ in range(6):
             if beats:
                 client.beat()
             client.finger(0.0, 0.0, 0.4)
-            run(client, stepped, 0.05)
+            stepped.run(client, 0.05)
     if not stops:
         assert client.telemetry().state == State.PLAYING
         return
@@ -272,7 +269,7 @@ def test_the_board_stops_without_a_beat_of_the_application(stepped, beats, stops
 
 @pytest.mark.parametrize("wrong", [0.049, 66.0, -1.0, np.nan])
 def test_a_watchdog_that_no_board_can_count_is_refused(stepped, wrong):
-    client = client_of(stepped).open()
+    client = stepped.client().open()
     for right in (0.05, 65.0, None):
         client.watch(right)
     with pytest.raises(ValueError, match="must be 0.05 to 65 s on a board, or None"):

@@ -143,22 +143,19 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert not (tmp_path / "out" / "sensed.wav").exists()
 
 
-@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
-@pytest.mark.parametrize("method", ["__enter__", "play"])
-def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, monkeypatch, verb, method):
-    monkeypatch.setattr(OtherPlate, method, lambda *_: {}["usb"])
-    arguments = verb.format(tiny=tiny, out=tmp_path / "out").split()
-    status, _, errors = run(*arguments, "--driver", "other_plate:OtherPlate")
-    assert (status, errors[-1]) == (2, "hapticrender: other_plate:OtherPlate: KeyError: 'usb'")
+RAISED = [
+    (lambda *_: {}["usb"], "hapticrender: other_plate:OtherPlate: KeyError: 'usb'"),
+    (lambda *_: sys.exit(0), "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"),
+]
 
 
 @pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
 @pytest.mark.parametrize("method", ["__enter__", "play"])
-def test_a_driver_that_ends_the_program_is_an_error(run, tiny, tmp_path, monkeypatch, verb, method):
-    monkeypatch.setattr(OtherPlate, method, lambda *_: sys.exit(0))
-    status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path).split(), "--driver", "other_plate:OtherPlate")
-    ended = "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"
-    assert (status, errors[-1]) == (2, ended)
+@pytest.mark.parametrize(("fails", "line"), RAISED, ids=["raises", "exits"])
+def test_what_a_driver_raises_is_one_line(run, tiny, tmp_path, monkeypatch, verb, method, fails, line):
+    monkeypatch.setattr(OtherPlate, method, fails)
+    status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path / "out").split(), "--driver", "other_plate:OtherPlate")
+    assert (status, errors[-1]) == (2, line)
 
 
 def test_python_in_development_mode_shows_the_traceback():
@@ -268,6 +265,7 @@ def test_a_bad_scene_gets_one_line_and_nothing_is_written(run, tiny, tmp_path, o
     assert not (tmp_path / "out").exists()
 
 
+PLATE = "other_plate:OtherPlate"
 BAD_ARGUMENTS = [
     (["render", "{tiny}", "--out", "{out}", "--method", "magic"], "--method = 'magic': must be one of paper, "),
     (["render", "{tiny}", "--out", "{tiny}/below"], "is a file, must be a folder"),
@@ -278,6 +276,12 @@ BAD_ARGUMENTS = [
     (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
+    (["latency", "--driver", "simulated"], "must be a device with a cable, such as audio:0"),
+    (["latency", "--driver", "wavefile:{out}.wav"], "senses nothing: a round trip needs an input"),
+    (["latency", "--driver", "audio:no such card"], "audio:"),
+    (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
+    (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
+    (["validate", "--suite", "accuracy", "--driver", PLATE], "--suite runs no scenes, on simulated devices"),
 ]
 
 

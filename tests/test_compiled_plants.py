@@ -112,3 +112,20 @@ def test_noise_is_not_what_a_user_draws_from_the_seed_of_the_scene():
     noise = Plate(PlateParameters(), hr.Finger.absent(), seed=0).noise(5000).ravel()
     drawn = np.random.default_rng(0).standard_normal(len(noise))
     assert abs(np.corrcoef(noise, drawn)[0, 1]) < 5 / np.sqrt(len(noise))
+
+
+FREE, IDEAL = hr.Finger.absent(), {"sensor_noise": 0.0, "sensor_bits": 0}
+DELAYED = {
+    "plate": lambda delay, block: Plate(PlateParameters(current_bits=0, delay=delay, **IDEAL), FREE, block=block),
+    "mode": lambda delay, block: UltrasonicPlate(UltrasonicParameters(drive_bits=0, delay=delay), FREE, block=block),
+}
+
+
+@pytest.mark.parametrize("name", DELAYED)
+@pytest.mark.parametrize(("delay", "block"), [(1, 1), (5, 1), (5, 5), (8, 4), (4, 3)])
+def test_a_drive_acts_after_the_stated_number_of_samples(name, delay, block):
+    """It is held during its interval, and seen at the end of it."""
+    plant = DELAYED[name](delay, block)
+    drive = np.zeros((60, plant.drive_channels))
+    drive[10] = 1.0
+    assert np.flatnonzero(plant.run(drive).motion[:, 0])[0] == 10 + (delay - block) + 1

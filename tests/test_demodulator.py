@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal
 from scipy.signal import butter, sosfilt
-from test_bandwidth import MODEL, SETTINGS
+from test_stability import MODEL, SETTINGS
 
 import hapticrender as hr
 from hapticrender.control.demodulator import StarSTDFT

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from electroadhesive import FORCE, MU, RATE, SLIDE, SPEED, Screen, band, tone
 from held import amplitude
+from tables import scene_on
 from waves import phasor, read_back
 
 import hapticrender as hr
@@ -40,19 +41,9 @@ def test_a_friction_coefficient_other_than_assumed_is_corrected():
     assert band(recording)["rms_error_friction"] < NOISE
 
 
-class Untold(Screen):
-    """A screen that keeps the true friction to itself; or whose cable breaks at a sample."""
-
-    def __init__(self, breaks=None, **kind):
-        super().__init__(blind=False, **kind)
-        self.true, self.breaks = [], breaks
-
-    def _play(self, drive):
-        if self.breaks is not None and len(self.true) * self.block >= self.breaks:
-            raise hr.DeviceLost("screen: play: no answer")
-        played = super()._play(drive)
-        self.true.append(played.motion[:, 0])
-        return played._replace(motion=None)
+def untold(sample, sensed):
+    """The true friction is kept to oneself."""
+    return sensed._replace(motion=None)
 
 
 def shown_late(frequency, rate=RATE):
@@ -67,15 +58,15 @@ def shown_late(frequency, rate=RATE):
 @pytest.mark.parametrize(("frequency", "block"), [(100.0, 1), (300.0, 10)])
 def test_the_tribometers_delay_is_no_error_of_the_device(frequency, block):
     """Of which 100 Hz shows 10 and 300 Hz 31 %; the noise of 1 mN is its own error. Live as in `render`, to the end."""
-    scene, own = tone(frequency, duration=1.5), Untold(block=block)
+    scene, own = tone(frequency, duration=1.5), Screen(blind=False, block=block, tell=untold)
     recording = hr.render(scene, driver=own)
-    with hr.Player(scene, driver=Untold(block=block), paced=False) as player:
+    with hr.Player(scene, driver=Screen(blind=False, block=block, tell=untold), paced=False) as player:
         player.play(scene.texture)
         player.sleep(1.0)
         (live,) = player.state().bands
     assert recording.header.motion_source == "sensors"
     assert len(recording) == 1.5 * RATE
-    error = recording.motion[RATE // 2 :, 0] - np.concatenate(own.true)[RATE // 2 : len(recording)]
+    error = recording.motion[RATE // 2 :, 0] - np.concatenate(own.moved)[RATE // 2 : len(recording), 0]
     expected = np.hypot(shown_late(frequency) * FORCE / np.sqrt(2), 1e-3)
     assert error.std() < 1.05 * expected
     assert live.error < shown_late(frequency) + NOISE
@@ -83,9 +74,17 @@ def test_the_tribometers_delay_is_no_error_of_the_device(frequency, block):
 
 
 def test_no_sample_is_lost_where_the_tribometers_device_fails(tmp_path):
+    def breaks(sample, sensed):
+        if sample >= 5000:
+            raise hr.DeviceLost("screen: play: no answer")
+        return untold(sample, sensed)
+
     with pytest.raises(hr.DeviceLost):
-        hr.render(tone(100.0), driver=Untold(breaks=5000), journal=tmp_path / "cut.au")
+        hr.render(tone(100.0), driver=Screen(blind=False, tell=breaks), journal=tmp_path / "cut.au")
     assert len(hr.Recording.load(tmp_path / "cut.au")) == 5001  # and the one that is stopped
+
+
+TONE = hr.Grating(frequency=100.0, velocity=10e-3)
 
 
 @pytest.mark.parametrize(("device", "lifted"), [("electroadhesion", True), ("ultrasonic", False)])
@@ -96,11 +95,32 @@ def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
     position = abs(way % 0.1 - 0.05) - 0.025
     touches = [(0.0, 1.2), (2.4, 3.2)] if lifted else None
     finger = hr.Finger.sampled(position, rate=1000.0, normal_load=0.4, mechanics="light", touches=touches)
-    texture = hr.Grating(frequency=100.0, velocity=10e-3)
-    recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.2, device=device))
+    recording = hr.render(hr.Scene(texture=TONE, finger=finger, duration=3.2, device=device))
     late = recording.time > 0.3  # the first touch finds a loop that knows nothing yet
     assert not (recording.flags[late] & hr.Flag.SATURATED).any()
     assert amplitude(recording.motion, 100.0, 0.6, recording.rate)[0] == pytest.approx(10e-3 / 0.64, rel=0.01)
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+def test_a_finger_without_load_counts_as_lifted(device):
+    """Nothing is wanted of it, nothing is driven for it, and what follows is what was wanted."""
+    loads = ([0.0, 1.0, 1.01, 2.0, 2.01, 3.0], [0.4, 0.4, 0.0, 0.0, 0.4, 0.4])
+    finger = hr.Finger.sliding(speed=SPEED, normal_load=loads, mechanics="light")
+    recording = hr.render(scene_on(device, TONE, finger, 3.0))
+    away = (recording.time > 1.2) & (recording.time < 2.0)
+    assert not recording.target[away].any()
+    assert np.isnan(recording.position[away]).all()
+    assert abs(recording.drive[away]).max() < 1e-3 * abs(recording.drive).max()
+    assert amplitude(recording.motion, 100.0, 0.5, recording.rate)[0] == pytest.approx(10e-3 / 0.64, rel=0.01)
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
+def test_a_skin_faster_than_the_finger_is_refused(device):
+    """10.1 mm/s of skin velocity under a finger of 10 mm/s, against 10 mm/s."""
+    finger = hr.Finger.sliding(speed=0.01, normal_load=0.4, mechanics="light")
+    with pytest.raises(ValueError, match=r"skin velocity of 0.0101 m/s: must be <= 0.01 m/s, the median speed"):
+        hr.prepare(scene_on(device, hr.Grating(velocity=1.01e-2, frequency=100.0), finger, 1.0))
+    hr.prepare(scene_on(device, TONE, finger, 1.0))
 
 
 SENSORLESS = {"sensor": "impedance", "level": "carrier"}
@@ -156,52 +176,19 @@ def test_a_moist_finger_is_flagged_and_played_open_loop():
     assert ratio < 0.15
 
 
-FAST = 192_000  # Hz
-FULL = 10e-3  # A
-
-
-def played(tmp_path, **plant):
-    """The recording of half a second of 100 Hz, the scene, and the file's samples (A) that belong to it."""
-    driver = WaveFileDriver(tmp_path / "carrier.wav", rate=FAST, drive_channels=1, full_scale=FULL, subtype="DOUBLE")
-    scene = tone(100.0, duration=0.5, output="carrier", **plant)
-    recording = hr.render(scene, driver=driver)
-    return recording, scene, read_back(driver.path, full_scale=driver.full_scale)[:, 0]
-
-
-def held(recording, scene):
-    """Envelope of the current (A) that the recorded drive asks for, at the file's rate."""
-    envelope = ElectroadhesionRenderer().read(scene, None).compensation(recording.drive[:, 0])
-    return np.repeat(envelope, round(FAST / recording.rate))
-
-
-def test_the_attraction_of_the_file_is_the_wanted_force(tmp_path):
-    """Mean of g I(t)^2 cos^2 over whole turns of the carrier: bias/2 + half of 100 Hz, without harmonics.
-
-    To the rounding of the sums.  A sample of the drive is held for 16 of the file: sinc(f/rate)/sinc(f/file's rate).
-    """
-    recording, scene, file = played(tmp_path)
-    root = ElectroadhesionRenderer().read(scene, None).compensation
-    force = 2 * root.gain * (DROOP * file[FAST // 5 :][: FAST // 5]) ** 2  # 0.2 s from 0.2 s on
-    line, summed = 2 * np.fft.rfft(force) / len(force), len(force) * np.finfo(float).eps
-    assert abs(line[0]) / 2 == pytest.approx(root.bias, rel=summed)
-    last = recording.drive[-round(recording.rate / 10) :, 0]
-    wanted = 2 * abs(np.mean(last * np.exp(-2j * np.pi * 100 * np.arange(len(last)) / recording.rate)))
-    hold = np.sinc(100 / recording.rate) / np.sinc(100 / FAST)
-    assert abs(line[20]) == pytest.approx(wanted * hold, rel=summed)
-    assert abs(line[40]) < summed * abs(line[20])
-
-
 def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
-    """Every sample is the envelope's times cos(2 pi k 5/48).
+    """Every sample is the envelope's times cos(2 pi k 5/48), over what the file's hold leaves of the carrier.
 
     A phase counted in doubles modulo a turn loses at most 2^-53 turns a block, 1e-12 rad in these 1000 blocks.
     """
-    recording, scene, file = played(tmp_path)
-    wanted = held(recording, scene)
+    full, droop = 10e-3, np.sinc(5 / 48)
+    driver = WaveFileDriver(tmp_path / "a.wav", rate=192_000, drive_channels=1, full_scale=full, subtype="DOUBLE")
+    scene = tone(100.0, duration=0.5, output="carrier")
+    recording = hr.render(scene, driver=driver)
+    file = read_back(driver.path, full_scale=full)[:, 0]
+    envelope = ElectroadhesionRenderer().read(scene, None).compensation(recording.drive[:, 0])
+    wanted = np.repeat(envelope, round(driver.rate / recording.rate))
     turns = np.array([float(Fraction(5 * k % 48, 48)) for k in range(48)])
     carrier = np.cos(2 * np.pi * np.resize(turns, len(wanted)))
-    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / DROOP, rtol=0, atol=1e-11 * FULL)
-    assert file[0] == pytest.approx(wanted[0] / DROOP)
-
-
-DROOP = np.sinc(5 / 48)  # of a carrier behind the file's hold: the driver makes up for it
+    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / droop, rtol=0, atol=1e-11 * full)
+    assert file[0] == pytest.approx(wanted[0] / droop)

@@ -158,16 +158,6 @@ def test_a_stop_during_a_change_is_a_stop(change, rng):
     assert not entry.process(quiet(rng, CHANGE[1])).any()
 
 
-def test_a_texture_is_played_by_one_controller(change, rng):
-    entry, _, second = change
-    texture = SampledTexture(grating(frequency=80.0), RATE)
-    entry.play(texture, second)
-    entry.process(quiet(rng, 0.1))
-    third = plate_controller(tones(140.0), parameters=PlateParameters())
-    with pytest.raises(ValueError, match="texture: plays under another controller"):
-        entry.play(texture, third)
-
-
 def test_two_changes_at_once_come_one_after_the_other(change, rng):
     """The third texture waits until the second one's controller has taken over."""
     entry, first, second = change
@@ -182,8 +172,13 @@ def test_two_changes_at_once_come_one_after_the_other(change, rng):
     assert entry.running is third
 
 
-def test_a_controller_of_another_device_is_refused(change):
-    entry, _, _ = change
+def test_a_controller_of_another_device_or_beside_the_textures_own_is_refused(change):
+    entry, _, second = change
+    texture = SampledTexture(grating(frequency=80.0), RATE)
+    entry.play(texture, second)
+    other = plate_controller(tones(140.0), parameters=PlateParameters())
+    with pytest.raises(ValueError, match="texture: plays under another controller"):
+        entry.play(texture, other)
     other = plate_controller(tones(100.0), parameters=PlateParameters(), delay=10, block=10)
     with pytest.raises(ValueError, match=r"controller\.block = 10: must be 1, as of the one before"):
         entry.play(SampledTexture(grating(frequency=80.0), RATE), other)

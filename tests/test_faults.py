@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from other_plate import OtherPlate
 from strangers_plate import StrangersPlate
+from synthetic import make_bands
+from waves import Own
 
 import hapticrender as hr
 
@@ -43,24 +45,15 @@ def logged(path):
     return Logged(path, block=25, told=25, delay=25)
 
 
-class Failing:
+def failing(error):
     """A texture whose application fails after half a second."""
 
-    def __init__(self, error):
-        self.error = error
-
-    def bands(self, rate):
-        return hr.Bands(frequency=[], wavenumber=[], phase=[])
-
-    def waveform(self, at, position):
+    def waveform(at, position):
         if at.size < 100 and at[-1] > 0.5:  # not while it is designed for
-            raise self.error
+            raise error
         return 20e-6 * np.sin(2 * np.pi * 72.0 * at)
 
-
-def played_after(driver, moment):
-    """Drive of every sample from `moment` (s) on."""
-    return np.concatenate(driver.played)[round(moment * driver.rate) :]
+    return Own(waveform)
 
 
 def stopped(recording):
@@ -76,7 +69,7 @@ def test_an_exception_in_the_application_ends_in_zero_drive(block, error):
     """The block in hand has been played; the next is zero, as many as it takes to come through."""
     plate = Logged(block=block, told=block, delay=block)
     with pytest.raises(type(error)):
-        hr.render(hr.Scene(texture=Failing(error), duration=1.0), driver=plate)
+        hr.render(hr.Scene(texture=failing(error), duration=1.0), driver=plate)
     drive = np.concatenate(plate.played)
     before = round(0.5 * RATE)
     assert np.any(drive[before - 200 : before])
@@ -84,18 +77,6 @@ def test_an_exception_in_the_application_ends_in_zero_drive(block, error):
     assert last < before + 2 * block + 14  # the waveform is asked for up to 13 samples ahead
     assert not drive[last + 1 :].any()
     assert len(drive) > last + 1
-
-
-def test_an_exception_in_the_progress_of_an_application_ends_in_zero_drive():
-    def progress(done, total):
-        if done > 0.5:
-            raise RuntimeError("the app broke")
-
-    plate = Logged()
-    with pytest.raises(RuntimeError, match="the app broke"):
-        hr.render(scene(), driver=plate, progress=progress)
-    assert not plate.played[-1].any()
-    assert len(plate.played) <= 0.5 * RATE + 3
 
 
 def scene(frequency=72.0, amplitude=20e-6, duration=1.0, **fields):
@@ -132,29 +113,31 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     np.testing.assert_array_equal(stopped(recording), drive.reshape(-1, 2)[: len(recording) - 1])
 
 
-class Interrupted:
-    """A tone whose reference is computed, for the journal, when Ctrl-C comes."""
+def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
+    """Ctrl-C while the reference of a tone is computed for the journal; SIGTERM is left as it was before."""
+    came = []
 
-    caught = False
-
-    def bands(self, rate):
-        return hr.Bands(frequency=[72.0], wavenumber=[0.0], phase=[0.0], envelope=[20e-6 + 0j])
-
-    def waveform(self, at, position):
-        if at[0] > 0.2 and not self.caught:
-            self.caught = True
+    def waveform(at, position):
+        if at[0] > 0.2 and not came:
+            came.append(True)
             raise KeyboardInterrupt
         return 20e-6 * np.cos(2 * np.pi * 72.0 * at)
 
-
-def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
-    plate = Logged(block=25, told=25, delay=25)
+    plate, texture = Logged(block=25, told=25, delay=25), Own(waveform, bands=make_bands(72.0, 20e-6))
     with pytest.raises(KeyboardInterrupt):
-        hr.render(hr.Scene(texture=Interrupted(), duration=2.0), driver=plate, journal=tmp_path / "run.au")
+        hr.render(hr.Scene(texture=texture, duration=2.0), driver=plate, journal=tmp_path / "run.au")
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     played = np.concatenate(plate.played)
     recording = hr.Recording.load(tmp_path / "run.au")
     np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end
     assert not played[-25:].any()
+
+
+def test_the_loop_itself_ends_with_zero_drive():
+    plate = Logged(block=4, told=8, delay=8)
+    hr.render(scene(), driver=plate)
+    assert not np.any(plate.played[-2:])
+    assert np.any(plate.played[-3])
 
 
 def lost(sample, sensed):
@@ -184,7 +167,7 @@ def test_a_gain_of_1_6_during_a_run_goes_on():
     plate = Logged(spoil=grown)
     with pytest.warns(hr.PlateMismatch):
         recording = hr.render(scene(duration=2.0), driver=plate)
-    assert abs(played_after(plate, 0.5)).max() < recording.header.drive_limit
+    assert abs(np.concatenate(plate.played)[round(0.5 * RATE) :]).max() < recording.header.drive_limit
     settled = recording.read("sensed", round(1.5 * RATE)) / 1.6
     assert np.ptp(settled, axis=0).max() / 2 < 25e-6
 

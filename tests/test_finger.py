@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hapticrender.touch.finger import Finger
-from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND, NONE
+from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
 from hapticrender.touch.motion import Nowhere, Sampled, SineMotion, Still, TriangleMotion
 
 PAPER = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])
@@ -45,14 +45,6 @@ def test_second_order_for_fourth_light():
     assert [at[111.0], at[170.0], at[400.0]] == pytest.approx([0.31, 1.29, 5.27], abs=0.005)
     crossing = np.interp(0.25, ratio[(GRID > 90) & (GRID < 120)], GRID[(GRID > 90) & (GRID < 120)])
     assert round(crossing) == 107
-
-
-def test_no_mechanics_no_impedance():
-    assert not NONE.impedance(GRID).any()
-    with pytest.raises(ValueError, match=r"order = 0: must be 2 or 4"):
-        NONE.skin_velocity_per_force(GRID)
-    with pytest.raises(ValueError, match=r"frequency = .*: must be finite numbers > 0 Hz"):
-        LIGHT.impedance(np.array([0.0]))
 
 
 def test_load_scaling_is_a_cube_root():

@@ -7,19 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from board import ROOT, SANITISED, compile_c
-from laws import (
-    DEVICES,
-    FINGERS,
-    KINDS,
-    PARTS,
-    RATE,
-    SAMPLES,
-    TEXTURES,
-    White,
-    ahead_of,
-    close,
-    kernel_of,
-)
+from laws import DEVICES, FINGERS, KINDS, PARTS, RATE, SAMPLES, TEXTURES, White, ahead_of, close, kernel_of
 from test_supervisor import Rewired
 from waves import waveform_error
 

@@ -5,11 +5,10 @@ import pytest
 import waves
 from electroadhesive import Screen
 from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
-from test_ultrasonic_rendering import Watched, friction_of
+from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
 from hapticrender.plants.surface import SurfaceParameters
-from hapticrender.plants.ultrasonic import UltrasonicParameters
 
 RATE = 5000.0
 MUST = 0.03  # of the waveform: what the project has set itself
@@ -90,11 +89,11 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
 
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know():
     """True friction is the law's, of the true amplitude; what the recording infers is within a point of it."""
-    device = Watched(UltrasonicParameters(delay=16), block=16)
+    device = watched()
     scene = hr.Scene(texture=white(0.6), finger=FINGERS["usual"], device="ultrasonic", duration=0.6, settle=0.2)
     recording = hr.render(scene, driver=device)
     p, steps = SurfaceParameters(), round(192e3 / recording.rate)
-    amplitude = abs(hilbert(np.concatenate(device.moved)))
+    amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
     film = p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, 0.08)
     kept = np.exp(-0.08 / 192e3 / p.memory_length)
     true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
@@ -110,56 +109,35 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     assert "inferred by a law that is assumed" in summary["reason"]
 
 
-class Weighed(Watched):
-    """A plate under a finger of 0.8 N, which it tells or keeps to itself."""
-
-    def __init__(self, tells):
-        heavy = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light")
-        super().__init__(UltrasonicParameters(delay=16), heavy, block=16)
-        self.tells = tells
-
-    def _play(self, drive):
-        return super()._play(drive)._replace(normal_load=np.full(len(drive), 0.8) if self.tells else None)
-
-
 @pytest.mark.parametrize(("tells", "least", "most"), [(True, 0.97, 1.03), (False, 1.5, 3.0)])
 def test_the_load_that_a_device_tells_is_used(tells, least, most):
     """A scene states half of it: friction comes out about twice as large where the device does not tell."""
     texture = hr.Grating(frequency=200.0, velocity=10e-3)
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
-    device = Weighed(tells)
+    heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(16, 0.8) if tells else None
+    device = watched(heavy, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
     recording = hr.render(
         hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.5, settle=0.2), driver=device
     )
-    assert least < friction_of(np.concatenate(device.moved), 200.0, load=0.8) / (10e-3 / 0.64) < most
+    assert least < friction_of(np.concatenate(device.moved)[:, 0], 200.0, load=0.8) / (10e-3 / 0.64) < most
     assert recording.summary()["verdict"] != "passed"
-
-
-class Signed(Screen):
-    """A screen whose tribometer keeps the sign of the lateral force; it tells nothing else."""
-
-    def __init__(self, finger, *, blind):
-        super().__init__(blind=blind, finger=finger)
-        self.finger, self.true = finger, []
-
-    def _play(self, drive):
-        start = len(self.true) / self.rate
-        played = super()._play(drive)
-        self.true += [float(each) for each in self.plant.motion[:, 0]]
-        way = np.diff(self.finger.position(np.array([start, start + 1 / self.rate])))
-        return played._replace(sensed=played.sensed * np.sign(way), motion=None)
 
 
 def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
     """Ridges of 1 mm under swipes at 3 Hz: the sign turns with the finger, the friction does not."""
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
+
+    def signed(sample, sensed):
+        way = np.diff(finger.position(np.array([sample, sample + 1]) / 10e3))
+        return sensed._replace(sensed=sensed.sensed * np.sign(way), motion=None)
+
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
     late = slice(5000, 14_000)
     for blind in (True, False):
-        screen = Signed(finger, blind=blind)
+        screen = Screen(blind=blind, finger=finger, tell=signed)
         scene = hr.Scene(texture=ridges(), finger=finger, device="electroadhesion", duration=1.5)
         recording = hr.render(scene, driver=screen)
-        true, asked = np.array(screen.true)[: len(recording)], recording.reference
+        true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors[blind] = np.std(played - asked) / np.std(asked)
     assert errors[True] < MUST

@@ -1,4 +1,4 @@
-"""House rules: what is shipped, who may import whom, and that docstrings and README are true."""
+"""House rules: what is shipped, who imports whom, what is taken from numba; docstrings and README are true."""
 
 import ast
 import doctest
@@ -13,6 +13,9 @@ from pathlib import Path
 import pytest
 
 import hapticrender
+from hapticrender import jit
+from hapticrender.control.kernel import error_step
+from hapticrender.jit import close_loop, digest
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -192,25 +195,150 @@ def test_doctests_run(name, tmp_path, monkeypatch):
     assert not runner.failures, "".join(complaints)
 
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+def blocks(page, language):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
-def blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
-
-
-def test_python_in_the_readme_runs(tmp_path, monkeypatch):
+@pytest.fixture
+def run_python(tmp_path, monkeypatch):
+    """Function that runs the Python of a page in one namespace, which it returns."""
     pytest.importorskip("matplotlib")
     pytest.importorskip("h5py")
     monkeypatch.chdir(tmp_path)
-    names = {"__name__": "readme"}
-    assert blocks("python")
-    for number, block in enumerate(blocks("python")):
-        exec(compile(block, f"README.md, Python block {number}", "exec"), names)
-    assert names["recording"].summary()["passed"]  # what a new user sees first
+
+    def run(page):
+        names = {"__name__": "page"}
+        assert blocks(page, "python")
+        for number, block in enumerate(blocks(page, "python")):
+            exec(compile(block, f"{page}, Python block {number}", "exec"), names)
+        return names
+
+    return run
+
+
+def test_python_in_the_readme_runs(run_python):
+    assert run_python("README.md")["recording"].summary()["passed"]  # what a new user sees first
+
+
+def test_python_on_the_page_about_the_finger_runs(run_python):
+    """The columns that it writes as CSV give the touch that the recording gives."""
+    names = run_python("docs/finger.md")
+    analyse = names["hr"].analyse_finger
+    assert analyse(names["theirs"]).of_kind(2) == names["found"].of_kind(2)
+    assert len(names["touch"].time) == 50
 
 
 def test_commands_in_the_readme_are_in_the_makefile():
     verbs = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
-    named = set(re.findall(r"^make ([\w-]+)", "".join(blocks("sh")), re.MULTILINE))
+    named = set(re.findall(r"^make ([\w-]+)", "".join(blocks("README.md", "sh")), re.MULTILINE))
     assert {"demo", "test"} <= named <= verbs
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+NAMED = re.compile(r"`([\w/]+\.py)`(?::((?: `[\w.]+`,?)+))?")
+
+
+def test_functions_in_the_theory_exist():
+    named = NAMED.findall((ROOT / "docs" / "theory.md").read_text(encoding="utf-8"))
+    assert len(named) > 30
+    missing = []
+    for file, names in named:
+        path = next((each for each in (ROOT / "hapticrender" / file, ROOT / file) if each.exists()), None)
+        source = path.read_text(encoding="utf-8") if path else ""
+        found = [re.search(rf"(?:def|class) {name.split('.')[-1]}\b", source) for name in re.findall(r"[\w.]+", names)]
+        if path is None or not all(found):
+            missing.append(f"{file}: {names}")
+    assert not missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    text = page.read_text(encoding="utf-8")
+    for target, anchor in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", text):
+        if "://" in target:
+            continue
+        path = page.parent / target if target else page
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {re.sub(r"[^\w -]", "", each).lower().replace(" ", "-") for each in headings}, anchor
+
+
+PACKAGES = ("numba", "llvmlite")
+TYPES = "int32 int64 uint32 uint64 float32 float64 complex128 boolean Float Integer Type CPointer".split()
+EXTENSION = "intrinsic lower_builtin models models.PrimitiveModel register_model type_callable".split()
+IR = "Constant DoubleType Function FunctionType IntType LiteralStructType PointerType Undefined VectorType".split()
+ALLOWED = {  # numba's user manual and extension manual, llvmlite's manual of its IR layer
+    *("numba.njit", "numba.cfunc", "numba.carray", "numba.from_dtype", "numba.types"),
+    *(f"numba.extending.{name}" for name in EXTENSION),
+    *(f"numba.types.{name}" for name in TYPES),
+    *("llvmlite.ir", *(f"llvmlite.ir.{name}" for name in IR)),
+}
+IN_INTRINSICS = {  # attributes of what numba hands to a code generator, and of its types
+    "context": {"get_value_type"},
+    "builder": set(
+        "inttoptr add mul call atomic_rmw extract_value insert_value extract_element insert_element shuffle_vector "
+        "sitofp fadd fsub fmul fdiv fma fneg fcmp_ordered icmp_unsigned select bitcast gep load store module".split()
+    ),
+    "signature": {"args", "return_type"},
+    "typingctx": set(),
+}
+OPTIONS = {"cache", "error_model", "fastmath", "nogil", "_nrt"}  # of njit and cfunc
+
+
+def bound_names(tree):
+    """Name in a module -> dotted name of what it stands for in numba or llvmlite."""
+    names = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                package = alias.name.split(".")[0]
+                if package in PACKAGES:
+                    names |= {alias.name: alias.name, alias.asname or package: alias.name if alias.asname else package}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES and not node.level:
+            names.update({alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names})
+    return names
+
+
+def outside(tree, names):
+    """All that a module takes from numba and llvmlite and that is not on the list."""
+    found = set(names.values()) - {"numba", "llvmlite", "numba.extending"} - ALLOWED
+    for node in ast.walk(tree):
+        first, _, rest = ast.unparse(node).partition(".") if isinstance(node, ast.Attribute) else ("", "", "")
+        full = f"{names[first]}.{rest}" if first in names else ""
+        if full and not any(full == each or each.startswith(f"{full}.") for each in ALLOWED):
+            found.add(full)
+        if isinstance(node, ast.FunctionDef | ast.Lambda) and any(each.arg == "builder" for each in node.args.args):
+            handed = [each for each in ast.walk(node) if isinstance(each, ast.Attribute)]
+            owners = [(ast.unparse(each.value), each.attr) for each in handed]
+            found |= {f"{owner}.{name}" for owner, name in owners if name not in IN_INTRINSICS.get(owner, {name})}
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("numba.njit", "numba.cfunc", "njit", "cfunc"):
+            found |= {f"option {each.arg}" for each in node.keywords if each.arg and each.arg not in OPTIONS}
+    return found | private_attributes(tree)
+
+
+def private_attributes(tree):
+    """Attributes with a leading underscore of anything but `self`, `cls`, a class of ours or a module's own name."""
+    own = {node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)} | {"self", "cls"}
+    return {
+        f"{ast.unparse(node.value)}.{node.attr}"
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__")
+        if ast.unparse(node.value).split(".")[0] not in own
+    }
+
+
+def test_shipped_code_uses_documented_names_only():
+    trees = {path.relative_to(ROOT).as_posix(): tree_of(path) for path in shipped_files()}
+    users = {name: outside(tree, names) for name, tree in trees.items() if (names := bound_names(tree))}
+    assert {"hapticrender/jit.py", "hapticrender/realtime_kernel.py", "hapticrender/control/kernel.py"} <= set(users)
+    assert not {name: found for name, found in users.items() if found}
+    assert set(jit.OPTIONS) <= OPTIONS
+
+
+def test_cached_code_is_named_by_the_state_of_the_sources():
+    """numba's cache sees an edit of a function's own file only; parts of a step lie in others."""
+    assert close_loop.py_func.__qualname__ == f"close_loop_{digest()}"
+    assert error_step.address > 0
+    assert error_step.function.__qualname__ == f"error_step_{digest()}"

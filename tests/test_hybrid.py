@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from live_devices import slide
+from live_devices import Told, slide
 from tables import scene_on
 
 import hapticrender as hr
 from hapticrender import loop
 from hapticrender.control.state_transfer import drive_limits
-from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import HybridPlant
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -88,27 +87,20 @@ def test_a_recording_over_position_is_shared_out_by_the_fades():
         assert band["rms_error_skin"] < 0.07  # sensor noise is in it, and the analysis of the swelling waveform
 
 
-class Bench(BaseDriver):
+def bench(sensed_channels=3, spoil=lambda sample, sensed: sensed):
     """A user's device: a plate and a screen that take currents and tell nothing but what is sensed."""
-
-    def __init__(self, played, sensed_channels=3):
-        self.device = HybridPlant(
-            Plate(PlateParameters(rate=RATE), SLIDE, 1),
-            ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE, 2),
-            0.64,
-        )
-        self.played = played
-        super().__init__(rate=RATE, drive_channels=3, sensed_channels=sensed_channels, block=1, delay=1)
-
-    def _play(self, drive):
-        self.played.append(drive[0].copy())
-        return Sensed(self.device.run(drive).sensed[:, : self.sensed_channels])
+    plate = Plate(PlateParameters(rate=RATE), SLIDE, 1)
+    screen = ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE, 2)
+    tell = lambda sample, sensed: Sensed(spoil(sample, sensed.sensed))  # noqa: E731
+    device = Told(HybridPlant(plate, screen, 0.64), tell)
+    device.sensed_channels, device.probe = sensed_channels, True
+    return device
 
 
 def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
-    played = []
-    recording = hr.render(scene(tone(100.0), duration=0.8), driver=Bench(played))
-    envelope = np.array(played)[:, 2]
+    device = bench()
+    recording = hr.render(scene(tone(100.0), duration=0.8), driver=device)
+    envelope = np.concatenate(device.played)[:, 2]
     assert envelope.max() < 10e-3  # A
     assert envelope[5000:-1].min() > 0.0  # around a bias
     assert envelope[-1] == 0.0  # closed
@@ -119,33 +111,23 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
 
 def test_without_sensors_both_parts_are_driven_open_loop():
     """From the free device: a finger of 0.4 N takes a little of the plate's half, friction comes as designed."""
-    played = []
-    recording = hr.render(scene(tone(100.0), duration=0.5), driver=Bench(played, sensed_channels=0))
+    device = bench(sensed_channels=0)
+    recording = hr.render(scene(tone(100.0), duration=0.5), driver=device)
     assert np.isnan(recording.motion).all()
     assert abs(recording.target[-1, 0]) == pytest.approx(0.02, rel=1e-6)
-    peaks = abs(np.array(played)[3000:]).max(axis=0)
+    peaks = abs(np.concatenate(device.played)[3000:]).max(axis=0)
     assert (peaks[:2] > 0.02).all()
     assert peaks[2] > 1e-3
 
 
-class Failing(Bench):
-    """Its first sensor gives no numbers from a time (s) on."""
-
-    def __init__(self, at):
-        super().__init__([])
-        self.left = round(at * RATE)
-
-    def _play(self, drive):
-        sensed = super()._play(drive)
-        self.left -= 1
-        if self.left < 0:
-            sensed.sensed[:, 0] = np.nan
-        return sensed
-
-
 def test_a_fault_of_a_part_stops_the_whole_device_at_the_time_it_is_said_to():
     """Live: the plate, and its supervisor, play from 0.2 s on; a fault takes 18 ms to be seen, a fade 10 ms."""
-    driver = Failing(0.3)
+
+    def failing(sample, sensed):
+        """The first sensor gives no numbers from 0.3 s on."""
+        return sensed * [np.nan if sample >= 0.3 * RATE else 1.0, 1.0, 1.0]
+
+    driver = bench(spoil=failing)
     with hr.Player("hybrid", driver, paced=False) as player:
         player.finger(-0.02, 0.08, 0.4)
         player.play(tone(250.0))
@@ -198,14 +180,6 @@ def test_a_part_that_does_not_play_leaves_the_other_limits():
         assert (limits > 0.0).tolist() == [bool(each) for each in plays]
 
 
-class Seeing(Bench):
-    """It senses the finger's position, too."""
-
-    def _play(self, drive):
-        found = self.device.run(drive)
-        return Sensed(found.sensed, position=found.position)
-
-
 @pytest.mark.parametrize("live", [False, True])
 def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
     """A tone of 250 Hz is on the screen alone, and shown 2 zeta/w0 = 159 us late: 25 % of it, where that is left in.
@@ -213,7 +187,8 @@ def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
     What remains is 0.65 % of the tribometer beside its delay, 0.3 % of the lines between samples, and the noise of a
     difference of the plate's sensors, 1 um rms each, over 15 000 samples: 0.6 %, five times over.
     """
-    plays, driver = replace(scene(tone(250.0), duration=2.0), settle=0.5), Seeing([])
+    plays, driver = replace(scene(tone(250.0), duration=2.0), settle=0.5), bench()
+    driver.tell = lambda sample, sensed: Sensed(sensed.sensed, position=sensed.position)  # and where the finger is
     if live:
         with hr.Player(plays, driver, paced=False) as player:
             player.play(plays.texture)

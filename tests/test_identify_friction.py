@@ -97,18 +97,12 @@ def test_intervals_of_a_screen_hold_what_skin_leaves():
     assert min(inside.values()) >= 7
 
 
-def test_what_cannot_be_identified_is_refused():
-    with pytest.raises(hr.DesignError, match="unexplained"):
-        identify_resonance(Resonator(force=0.0), SurfaceParameters())
-    with pytest.raises(hr.DesignError, match="must slide faster than 0.001 m/s"):
-        identify_screen(Screen(speed=0.0), ElectroadhesionParameters(), hr.Finger.absent())
-    with pytest.raises(hr.DesignError, match="identified open_loop_gain = -.*: must be a finite number > 0 N"):
-        identify_screen(Screen(gain=-1.5e4), ElectroadhesionParameters(), hr.Finger.absent())
-
-
 @pytest.mark.parametrize(
     ("device", "message"),
     [
+        (Resonator(force=0.0), "unexplained"),
+        (Screen(speed=0.0), "must slide faster than 0.001 m/s"),
+        (Screen(gain=-1.5e4), "identified open_loop_gain = -.*: must be a finite number > 0 N"),
         (Resonator(unit=0.0), "sensed no motion at any line of the drive: check the sensor's connection"),
         (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
         (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
@@ -116,7 +110,7 @@ def test_what_cannot_be_identified_is_refused():
         (Screen(unit=1e3), r"sensed \d+ N: must be <= 20 N, .* is it in N"),
     ],
 )
-def test_a_sensor_that_no_scene_can_use_is_refused(device, message):
+def test_what_cannot_be_identified_or_used_is_refused(device, message):
     screen = isinstance(device, Screen)
     arguments = (ElectroadhesionParameters(), hr.Finger.absent()) if screen else (SurfaceParameters(),)
     with pytest.raises(hr.DesignError, match=message):

@@ -153,12 +153,6 @@ def test_the_gain_schedule_is_the_printed_one():
     assert [(each["detects"], each["damper"]) for each in (p, crowded)] == [(1.0, 0.0), (0.0, 0.2)]
 
 
-def test_part_of_a_block_is_refused():
-    controller = plate_controller(tones([47.0]), delay=25, block=25)
-    with pytest.raises(ValueError, match="30 samples: must be a multiple of the block of 25 samples"):
-        controller.run(np.zeros((30, 2)), np.zeros(30), np.zeros(30))
-
-
 @pytest.mark.parametrize(("delay", "block"), [(1, 1), (64, 64)])
 def test_phases_after_ten_hours(delay, block):
     """Set to what 10 h of counting leaves, the phase goes on right; counting itself rounds once a refresh.

@@ -1,8 +1,6 @@
 """The loop: block by block equals sample by sample, refusals come before anything is played, crashes end at rest."""
 
 import dataclasses
-import os
-import signal
 from functools import partial
 
 import numpy as np
@@ -24,31 +22,22 @@ TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.
 COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags", "reference")
 
 
-class Blocks:
-    """A driver that shows the loop nothing of the plant behind it but its blocks."""
+class Blocks(SimulatedDriver):
+    """A driver that is handed blocks alone, and keeps them."""
 
-    probe = False
+    exchange, probe = None, False
 
-    def __init__(self, driver):
-        self._driver = driver
-        for name in ("rate", "drive_channels", "sensed_channels", "block", "delay"):
-            setattr(self, name, getattr(driver, name))
+    def __init__(self, plant):
+        super().__init__(plant)
         self.played = []
-
-    def __enter__(self):
-        self._driver.__enter__()
-        return self
-
-    def __exit__(self, *exc):
-        self._driver.__exit__(*exc)
 
     def play(self, drive):
         self.played.append(drive.copy())
-        return self._driver.play(drive)
+        return super().play(drive)
 
 
-def simulated(scene, seed=0, block=1, **overrides):
-    return SimulatedDriver(Plate(PlateParameters(**overrides), scene.finger, seed, block))
+def simulated(scene, seed=0, block=1, kind=SimulatedDriver, **overrides):
+    return kind(Plate(PlateParameters(**overrides), scene.finger, seed, block))
 
 
 def equal(one, other, columns=COLUMNS, rounding=0.0):
@@ -72,7 +61,7 @@ def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
     expected = hr.render(scene, method=method, seed=5)
     equal(
         expected,
-        hr.render(scene, method=method, seed=5, driver=Blocks(simulated(scene, 5))),
+        hr.render(scene, method=method, seed=5, driver=simulated(scene, 5, kind=Blocks)),
         rounding=2 * len(expected.drive) * np.finfo(float).eps,
     )
 
@@ -81,20 +70,19 @@ class Scaling(Blocks):
     """Converts the drive in place, and stops by itself from block 1000 on."""
 
     def play(self, drive):
-        self.played.append(drive.copy())
-        sensed = self._driver.play(drive.copy())
+        sensed = super().play(drive.copy())
         drive *= 3.0
         stops = len(self.played) > 1000
         return sensed._replace(flags=np.full(len(drive), int(hr.Flag.STOPPED))) if stops else sensed
 
 
 def test_a_driver_may_convert_the_drive_in_place_and_stop_the_device():
-    driver = Scaling(simulated(TONE))
+    driver = simulated(TONE, kind=Scaling)
     with pytest.raises(hr.DeviceFault, match=r"stopped at 0\.2 s: the device stopped itself") as stopped:
         hr.render(TONE, driver=driver)
     drive = stopped.value.recording.drive
     np.testing.assert_array_equal(drive, np.concatenate(driver.played)[: len(drive)])
-    with hr.Player(driver=Scaling(simulated(TONE)), paced=False) as player:
+    with hr.Player(driver=simulated(TONE, kind=Scaling), paced=False) as player:
         player.play(TONE.texture)
         with pytest.raises(hr.DeviceFault, match=r"stopped at 0\.2 s: the device stopped itself"):
             player.sleep(0.5)
@@ -137,71 +125,6 @@ def test_an_odd_duration_is_rounded_to_samples_whatever_the_block():
     scene = dataclasses.replace(TONE, duration=0.1003)
     assert hr.render(scene).drive.shape == (502, 2)  # 501.5 rounds to even
     assert hr.render(scene, driver=simulated(scene, block=7, delay=7)).drive.shape == (502, 2)
-
-
-class Faulty(Blocks):
-    """Fails in block `at`, by an exception or by what it returns."""
-
-    def __init__(self, driver, at, fault):
-        super().__init__(driver)
-        self.at, self.fault = at, fault
-
-    def play(self, drive):
-        sensed = super().play(drive)
-        return self.fault(sensed) if len(self.played) > self.at else sensed
-
-
-class Bare(Blocks):
-    """A driver whose exit leaves the device as it is."""
-
-    def __exit__(self, *exc):
-        pass
-
-
-def test_the_loop_itself_ends_with_zero_drive():
-    driver = Bare(simulated(TONE, block=4, delay=8))
-    hr.render(TONE, driver=driver)
-    assert not np.any(driver.played[-2:])
-    assert np.any(driver.played[-3])
-
-
-@pytest.mark.skipif(not hasattr(os, "kill") or os.name == "nt", reason="no SIGTERM on this system")
-def test_sigterm_leaves_the_device_at_rest_and_the_journal_whole(tmp_path):
-    def stop(sensed):
-        os.kill(os.getpid(), signal.SIGTERM)
-        return sensed
-
-    inner = simulated(TONE)
-    with pytest.raises(SystemExit) as ended:
-        hr.render(TONE, driver=Faulty(inner, 700, stop), journal=tmp_path / "run.au")
-    assert ended.value.code == 128 + signal.SIGTERM
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
-    assert len(hr.Recording.load(tmp_path / "run.au").time) in (700, 701)
-    assert not inner.plant.state["current"].any()
-
-
-def own(bands=lambda rate: hr.Bands(frequency=[100.0], wavenumber=[0.0], phase=[0.0]), waveform=np.zeros_like):
-    """A texture made of two functions."""
-    kind = type("Own", (), {"bands": lambda _, rate: bands(rate), "waveform": lambda _, t, x: waveform(t)})
-    return hr.Scene(texture=kind(), duration=0.1)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "error", "message"),
-    [
-        ({"driver": SimulatedDriver}, TypeError, r"driver = SimulatedDriver: must be an instance, not the class"),
-        ({"renderer": object()}, TypeError, r"renderer: must be an object with open\(scene, driver\).*not object"),
-        ({"scene": own(lambda rate: None)}, TypeError, "Own.bands returned NoneType: must be hapticrender.Bands"),
-        (
-            {"scene": own(waveform=lambda t: t[:-1])},
-            ValueError,
-            r"Own.waveform returned float64 of shape \(\d+,\): must be",
-        ),
-    ],
-)
-def test_what_is_handed_over_by_mistake_is_named(arguments, error, message):
-    with pytest.raises(error, match=message):
-        hr.render(**{"scene": TONE, **arguments})
 
 
 scene_with = partial(dataclasses.replace, TONE)

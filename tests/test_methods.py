@@ -1,10 +1,11 @@
 """What every control method promises, and where the plain ones stop: the figures of FACTS section 3 on this plate."""
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from held import amplitude_error, fixed, grating, hold
+from held import amplitude, amplitude_error, envelopes, fixed, grating, hold, play
 from synthetic import make_bands
 from waves import phasor
 
@@ -12,6 +13,7 @@ import hapticrender as hr
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.methods import METHODS, Resonant, least_decay
 from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch.mechanics import HEAVY_SECOND
 
 RATE = 5000.0
 WANTED = 10e-6
@@ -121,12 +123,140 @@ def test_integrators_without_a_low_pass_take_the_damping_of_a_mode(gain, holds, 
     assert late < 0.01 * early if holds else late > 10 * early
 
 
-def test_the_resonant_method_refuses_a_gain_that_drives_a_mode():
-    with pytest.raises(hr.DesignError, match=r"gain=17 1/s must be below 16\.1 1/s"):
-        Resonant(gain=17.0).design(MODEL, tones(47.0))
+NOISY, QUIET = PlateParameters(), PlateParameters(sensor_noise=0.0)
 
 
-@pytest.mark.parametrize("name", ["boxcar", "static", "stiffness", "resonant"])
-def test_too_long_a_delay_is_refused(name):
-    with pytest.raises(hr.DesignError, match="margin|unstable|sensitivity"):
-        METHODS[name].design(PlateParameters(delay=25_000).device_model(RATE, 25_000), tones(47.0))
+@pytest.mark.parametrize(("frequency", "target"), [(20.0, 100e-6), (31.0, 10e-6), (72.0, 10e-6), (400.0, 10e-6)])
+def test_baseline_holds_on_the_free_plate(frequency, target):
+    """<= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
+
+    Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
+    """
+    for plate, bound in ((NOISY, 3e-3), (QUIET, 1.5e-3)):
+        motion = hold("paper", fixed((frequency, target)), 21.0, plate)[1]
+        error = amplitude(motion, frequency, 20.0) / target - 1.0
+        assert abs(error).max() <= bound
+
+
+@pytest.mark.parametrize(("frequency", "stable"), [(125, True), (131, False), (188, False), (192, True)])
+def test_two_sides_apart_are_unstable_between_129_and_189_hz(frequency, stable):
+    """From the eigen-loops rho = rocking/heave receptance ; 2 and 3 Hz outside, growth is slow."""
+    motion = hold("paper", fixed((float(frequency), 10e-6)), 41.0, IDEAL)[1]
+    error = abs(amplitude(motion, frequency, 1.0) / 10e-6 - 1.0).max()
+    assert error < 0.01 if stable else error > 0.1
+
+
+@pytest.mark.parametrize(
+    ("frequency", "target", "position", "expected", "within"),
+    [
+        (20.0, 1e-6, 0.0, -1.0, 1e-6),
+        (31.0, 1e-6, 0.0, -1.0, 1e-6),
+        (20.0, 10e-6, 0.0, -0.079, 0.003),
+        (20.0, 10e-6, 10e-3, -0.098, 0.003),
+    ],
+)
+def test_a_press_blinds_it_at_low_frequency(frequency, target, position, expected, within):
+    """0.5 N sags 11 um, which leaks through L; the paper says that it ignores the load.
+
+    The sag adds a phasor of 2 * 11.04 um * |L(20 Hz)| = 5.35 um that turns at 20 Hz, so that the mean of |X| is
+    A + 5.35^2/(4 A): it is 10 um at A = 9.22 um, and the 2f image takes another 0.12 %.  That is with the finger in
+    the middle; -9.8 % is found with the finger 10 mm to one side, and 27.5 mm to one side gives -50 %.
+    """
+    finger = hr.Finger.still(position=position, normal_load=0.5, mechanics="none")
+    motion = hold("paper", fixed((frequency, target)), 14.0, QUIET, finger=finger)[1]
+    error = amplitude(motion, frequency, 10.0)[0] / target - 1.0
+    assert error == pytest.approx(expected, abs=within)
+
+
+def test_a_table_of_the_loaded_plate_limit_cycles_at_lift_off():
+    """at 189 Hz the free plate has 3.9 x the gain of the loaded one, above the gain margin of 3.5."""
+    free = IDEAL.device_model(RATE, 1)
+    finger = np.diag([1.0, 0.0])
+    loaded = dataclasses.replace(
+        free,
+        mass=free.mass + HEAVY_SECOND.mass * finger,
+        damping=free.damping + HEAVY_SECOND.damping * finger,
+        stiffness=free.stiffness + HEAVY_SECOND.stiffness * finger,
+    )
+    spread = {}
+    for name, table in (("free", free), ("loaded", loaded)):
+        motion = play(METHODS["paper-common"].design(table, fixed((189.0, 10e-6))), 10.0, IDEAL)[1]
+        time, found = envelopes(motion, 2 * np.pi * 189.0 * np.arange(len(motion)) / RATE, RATE, 0.05)
+        spread[name] = abs(found[time > 8.0, 0]).std() / 10e-6
+    assert spread["free"] < 0.01
+    assert spread["loaded"] > 0.3
+
+
+TONE, RIDGES = make_bands(47.0, 1e-5), make_bands(0.0, 1e-5, 1e3)
+
+
+class Bench:
+    """A method on the plate: compiled while all is well, by hand where something is spoilt on its way."""
+
+    def __init__(self, method, bands, finger=None):
+        parameters = PlateParameters()
+        self.plate = Plate(parameters, finger or hr.Finger.absent())
+        self.controller = METHODS[method].design(parameters.device_model(RATE, 1), bands)
+
+    def run(self, count):
+        drive, _, flags, sensed = self.plate.closed_loop(self.controller, np.zeros(count))
+        return drive, sensed.motion[:, 0], flags
+
+    def spoilt(self, count, spoil):
+        """`spoil(i, sensed, position)` returns what the controller is told instead."""
+        drive, motion, flags = np.zeros((count, 2)), np.zeros(count), np.zeros(count, int)
+        for i in range(count):
+            drive[i] = self.plate._last
+            sensed = self.plate.run(drive[i : i + 1])
+            motion[i] = sensed.motion[0, 0]
+            said, _, flag = self.controller.run(*spoil(i, sensed.sensed, sensed.position), np.zeros(1))
+            self.plate._last[:] = said[0]
+            flags[i] = flag[0]
+        return drive, motion, flags
+
+
+@pytest.mark.parametrize("bad", [np.nan, 2.5e-3])
+@pytest.mark.parametrize("method", METHODS)
+def test_a_dead_sensor_fades_the_drive_out_and_a_living_one_brings_it_back(method, bad):
+    """With zeros in place of what no sensor can show, a loop would integrate up to the current limit."""
+    bench = Bench(method, TONE)
+    before = abs(bench.run(5000)[0][4000:]).max()
+    assert before > 0.02
+    drive, motion, flags = bench.spoilt(600, lambda i, sensed, position: (np.full_like(sensed, bad), position))
+    assert np.all(flags & hr.Flag.NONFINITE)
+    assert abs(drive).max() <= 1.1 * before
+    assert not drive[102:].any()  # faded within 20 ms
+    assert abs(motion).max() < 2e-5
+    _, motion, _ = bench.run(10_000)
+    assert abs(phasor(motion[8936:10_000], 47.0)) == pytest.approx(1e-5, rel=0.05)  # ten periods
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_wild_position_moves_nothing(method):
+    """A sample 50 mm off would be 250 m/s: it is not believed, or the carrier's frequency would leave the table."""
+    motion = {}
+    for way in (0.0, 0.05):
+        bench = Bench(method, RIDGES, hr.Finger.sliding(speed=0.08, normal_load=0.3, mechanics="none"))
+        bench.run(7000)
+        spoilt = bench.spoilt(2, lambda i, sensed, position, way=way: (sensed, position + way * (i == 0)))[1]
+        after = np.concatenate([spoilt, bench.run(1500)[1]])
+        motion[way] = abs(after - after.mean()).max()
+    assert motion[0.05] < 1.6 * max(motion[0.0], 1e-5)
+
+
+@pytest.mark.parametrize("method", ["paper", "paper-common", "h", "h2"])
+def test_phase_is_right_again_soon_after_a_reversal(method):
+    """80 mm/s over 0.25 mm is 320 Hz, where the plant lags by 180 deg and the delay by 35 deg.
+
+    The command phase makes up for a lag that does not care about the finger's direction; conjugated with the
+    envelopes (naive) it was off by twice the lag, 16 deg for a third of a second.
+    """
+    parameters = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
+    finger = hr.Finger.sliding(speed=0.08, span=0.08, normal_load=0.0, mechanics="none")
+    controller = METHODS[method].design(parameters.device_model(RATE, 1), make_bands(0.0, 1e-6, 4e3))
+    plate = Plate(parameters, finger)
+    sensed = plate.closed_loop(controller, np.zeros(12_500))[3]  # turns at 0.5, 1.5, 2.5 s
+    n = np.arange(8250, 9000)  # 150 to 300 ms after a turn
+    carrier = np.exp(-2j * np.pi * 4e3 * sensed.position[n])
+    phase = np.angle(np.mean(sensed.motion[n, 0] * carrier))
+    assert abs(phase) < np.radians(5)

@@ -94,10 +94,7 @@ def test_a_board_that_does_not_open(table, error, match):
         ([(b"f\n", b"x\r\n")], "f: received 'x', must be f"),
         ([(b"f\n", b"f\r\nloop\n\r")], "f: received 'loop', must be closed loop turned on"),
         ([*CLOSED, *TONE[:2], (b"2\n", b"amp\t0.01\r\n")], "a: received 'amp\\t0.01', must be amp, frequency"),
-        (
-            [*CLOSED, *TONE[:2], (b"2\n", b"amp\t0.010000\tfrequency\t72.000000\r\n")],
-            "must be 0.010000 mm at 47 Hz",
-        ),
+        ([*CLOSED, *TONE[:2], (b"2\n", b"amp\t0.010000\tfrequency\t72.000000\r\n")], "must be 0.010000 mm at 47 Hz"),
         ([*CLOSED, *TONE[:2], (b"2\n", b"amp\t0.000100\tfrequency\t47.000000\r\n")], "must be 0.010000 mm at 47 Hz"),
         ([*CLOSED, *TONE[:2], (b"2\n", b"amp\tx\tfrequency\t47.000000\r\n")], "must be 2 numbers"),
     ],

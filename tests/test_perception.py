@@ -139,11 +139,3 @@ def test_bands_of_a_recording_and_no_bands_at_all_are_kept():
     recorded = Bands(frequency=[500.0], wavenumber=[0.0], phase=[0.0])
     for bands in (recorded, bands_of()):
         assert drop_unfelt(bands, **DEVICE) is bands
-
-
-def test_a_scene_of_which_nothing_is_felt_is_refused():
-    bands = bands_of((500.0, 0.0, 1e-12), (20.0, 0.0, 1e-6), (20.0, 0.0, 1e-12))
-    with pytest.raises(
-        ValueError, match=r"^no band can be felt: 20 Hz: target 1 µm is below .*, 3.16 µm .*keep_unfelt"
-    ):
-        drop_unfelt(bands, **DEVICE)

@@ -119,12 +119,6 @@ def test_c_and_python_find_the_same_in_a_damaged_stream(firmware, rng):
     assert set(found) <= sent
 
 
-def test_a_payload_that_is_too_long_is_refused():
-    protocol.encode(Frame(1, 0, bytes(protocol.MOST_PAYLOAD)))
-    with pytest.raises(ValueError, match="payload of 250 bytes: must be <= 249"):
-        protocol.encode(Frame(1, 0, bytes(protocol.MOST_PAYLOAD + 1)))
-
-
 @pytest.mark.parametrize(
     ("code", "match"),
     [

@@ -13,7 +13,6 @@ from synthetic import make_bands
 from test_kernel import friction_controller, plate_controller
 from waves import Own
 
-import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.jit import F8, kernel, pointer
@@ -253,15 +252,6 @@ def test_silence_is_zero_drive(rng):
     assert entry.samples == 600
 
 
-def test_a_sensor_fault_is_flagged():
-    entry = RealtimeEntry(controller())
-    sensed = np.zeros((BLOCK, 2))
-    sensed[3, 1] = np.nan
-    drive, answer = plain(entry, sensed)
-    assert answer == Flag.NONFINITE == entry.flags
-    assert np.isfinite(drive).all()
-
-
 @pytest.mark.skipif(sys.platform == "win32", reason="threads are made with pthread_create")
 def test_a_thread_of_c_plays_on_while_python_keeps_its_lock(rng):
     """Python holds its lock in a loop that never gives it up; a thread that never knew Python fills every block."""
@@ -332,29 +322,3 @@ def test_slots_change_hands_whole():
         found = pool.submit(read, *arguments, rounds)
         pool.submit(write, *arguments, rounds)
         assert found.result(60) == (0, 0)
-
-
-def test_what_it_refuses():
-    with pytest.raises(TypeError, match="controller of type object: must have a compiled step"):
-        RealtimeEntry(object())
-    entry = RealtimeEntry(controller())
-    with pytest.raises(ValueError, match="must be finite"):
-        entry.finger(0.0, np.nan)
-    with pytest.raises(ValueError, match="gain = nan"):
-        entry.set_gain(np.nan)
-
-
-def test_what_a_sampled_texture_refuses():
-    both = hr.Grating(frequency=50.0, amplitude=1e-6) + hr.Grating(wavelength=1e-3, amplitude=1e-6)
-    SampledTexture(both, RATE)  # each part where it lies
-    with pytest.raises(ValueError, match="Playlist with a part along the surface: play its parts one after another"):
-        SampledTexture(hr.Playlist([(hr.Grating(wavelength=1e-3, amplitude=1e-6), 1.0)]), RATE)
-
-    with pytest.raises(ValueError, match="Own: must not change with the finger's position"):
-        SampledTexture(Own(lambda time, position: 1e-6 * np.sin(position)), RATE)
-    touched = Own(lambda time, position: 1e-6 * np.sin(300.0 * time) * np.isfinite(position))  # would be silent
-    with pytest.raises(ValueError, match="Own: must not change with the finger's position or contact"):
-        SampledTexture(touched, RATE)
-    travels = Own(lambda time, position: 1e-6 * np.sin(2e3 * np.pi * position - 300.0 * time), spatial=True)
-    with pytest.raises(ValueError, match="Own: must not change with time: it lies along the surface"):
-        SampledTexture(travels, RATE)

@@ -1,30 +1,44 @@
 """What cannot be is refused by a sentence with the name, the value, the bound and the unit."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from electroadhesive import tone as friction_tone
-from synthetic import make_bands
-from tables import scene_on, tables
+from finger_data import make_impedance
+from synthetic import make_bands, make_recording
+from tables import LEVEL, scene_on, tables
+from test_kernel import plate_controller
+from waves import Own
 
 import hapticrender as hr
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.loopshape import reduced_controller
-from hapticrender.control.methods import method_named
+from hapticrender.control.methods import Resonant, method_named
+from hapticrender.drivers import protocol
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.nu32 import NU32Board
 from hapticrender.drivers.serial import BoardClient
+from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
+from hapticrender.loop import prepare
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.friction_laws import FitLaw, LoadSharing
 from hapticrender.plants.hybrid import HybridPlant
+from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.realtime_entry import RealtimeEntry
+from hapticrender.sampled_texture import SampledTexture
+from hapticrender.sweep import sweep
 from hapticrender.touch import latency_budget as budget
+from hapticrender.touch.mechanics import LIGHT_SECOND, NONE
 from hapticrender.touch.motion import Sampled, SineMotion, TriangleMotion
 from hapticrender.touch.motion_estimator import MotionEstimator
-from hapticrender.touch.perception import detection_threshold, from_velocity
+from hapticrender.touch.perception import detection_threshold, drop_unfelt, from_velocity
 from hapticrender.touch.touch_panel import TouchPanel
 
 TONE = hr.Grating(frequency=100.0, velocity=10e-3)
@@ -76,17 +90,70 @@ def limited(device, **limits):
     return hr.prepare(hr.Scene(texture=texture, finger=SLIDE, device=device, duration=0.1, limits=limits))
 
 
+def sampled(waveform, spatial=False):
+    return SampledTexture(Own(waveform, spatial), 5000.0)
+
+
+def in_blocks(size=25):
+    return plate_controller(make_bands(47.0, 1e-6), delay=size, block=size)
+
+
+def entry():
+    return RealtimeEntry(in_blocks(1))
+
+
+def played_late(method):
+    late = PlateParameters(delay=25_000).device_model(5000.0, 25_000)
+    return method_named(method).design(late, make_bands(47.0, 1e-5))
+
+
+def fitted(order=None, **changes):
+    return hr.fit_finger(replace(IMPEDANCE, **changes), order)
+
+
+def analysed(profile=None, rows=5000, block=1, **changes):
+    recording = hr.Recording(replace(ANALYSED.header, **changes), ANALYSED.frames[:rows], ANALYSED.scene)
+    return hr.analyse_finger(recording, profile, block=block)
+
+
+def rendered(texture=TONE, **arguments):
+    return hr.render(hr.Scene(texture=texture, duration=0.1), **arguments)
+
+
 def driver(**changes):
     return BaseDriver(**{"rate": 5000.0, "drive_channels": 2, "sensed_channels": 1, "block": 4} | changes)
 
 
+RECORDED = hr.Recorded(samples=np.sin(np.arange(20000) * 0.1), rate=1e4, amplitude=1e-5, carriers=8)
+
+
+def on_users(device, parameters=None, **changes):
+    users = BaseDriver(**{"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1} | changes)
+    return opened(device, driver=users, **parameters or {})
+
+
+CHIRP = hr.Chirp(start=20.0, stop=400.0, duration=2.0, amplitude=5e-6)
+PARTS = hr.Scene(texture=TONE + CHIRP, duration=1.0).to_toml().replace("chirp", "chimp")
+TONE_TOML = 'duration = 1.0\n[texture]\nkind = "grating"\nfrequency = 50.0\namplitude = 1e-6\n'
+TWO_FINGERS = TONE_TOML + 2 * '[[finger]]\nmotion = "still"\n'
+ROUND = hr.Playlist([(hr.Grating(wavelength=1e-3, amplitude=1e-6), 1.0)])
+IMPEDANCE = make_impedance(np.random.default_rng(0), LIGHT_SECOND, 3, (0.1, 0.49))
+ANALYSED = make_recording(make_bands(100.0, 1e-5), 0.0, duration=1.0)
+BARE = hr.Finger.sliding(speed=0.05)
+FELT = {"top_speed": 0.1, "lowest": 10.0, "highest": 400.0}
+FAINT = make_bands([500.0, 20.0, 20.0], [1e-12, 1e-6, 1e-12])
+MODEL = PlateParameters().device_model(5000.0, 1)
 IN_SPACE = {"frequency": None, "wavelength": 1e-3, "amplitude": None}
 HOT = {"level": "envelope", "temperature_rise": 100.0, "temperature_coefficient": -600e-6, "rate": 48e3}
-MASSLESS = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_damping": 1.0}
+A_COLUMN = np.zeros((5, 1))
+SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_damping": 1.0}
+MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
+SCREEN = friction_tone(100.0)
+BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08), "finger": SLIDE}
+STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
-USERS = {"rate": 192e3, "block": 16, "drive_channels": 1, "sensed_channels": 1}
-BLIND = USERS | {"sensed_channels": 0}
+TO_CARRIER, SLOW = ("electroadhesion", {"output": "carrier"}), {"rate": 79_999, "sensed_channels": 0}
 TWO_TONES = hr.Grating(frequency=60.0, amplitude=1e-5, partials=((1.0, 1.0, 0.0), (2.4, 0.4, 1.0)))
 
 TEXTURES = [
@@ -108,6 +175,12 @@ TEXTURES = [
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", rate=100.0), "rate = 100.0: must be left out, as the file has"),
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", **WHITE), "file, samples: exactly one must be given"),
     (lambda: hr.Sum([(TONE, 1.0), ("tone", 1.0)]), r"parts\[1\] = .*: must be 1 to 4096 pairs of a texture and a num"),
+    (lambda: drop_unfelt(FAINT, **FELT), "^no band can be felt: 20 Hz: target 1 µm is below .*, 3.16 µm .*keep_unfelt"),
+    (lambda: SampledTexture(ROUND, 5e3), "Playlist with a part along the surface: play its parts one after another"),
+    (lambda: sampled(lambda t, x: np.sin(x)), "Own: must not change with the finger's position"),
+    (lambda: sampled(lambda t, x: t * np.isfinite(x)), "Own: must not change with the finger's position or contact"),
+    (lambda: sampled(lambda t, x: t + x, True), "Own: must not change with time: it lies along the surface"),
+    (lambda: hr.Scene.from_toml_text(PARTS), r"texture\.parts\[1\]\[0\]\.kind = 'chimp': must be one of"),
     (lambda: detection_threshold([20.0, -3.0]), r"frequency = .*: must be finite numbers >= 0 Hz$"),
     (lambda: detection_threshold(np.nan), r"frequency = .*: must be finite numbers >= 0 Hz$"),
     (lambda: from_velocity(0.1, np.inf), r"frequency = .*: must be finite numbers > 0 Hz$"),
@@ -120,6 +193,25 @@ FINGERS = [
     (lambda: hr.Finger.still(mechanics="strong"), r"mechanics = 'strong': must be one of auto, none, light"),
     (lambda: hr.Finger.still(mechanics=UNIT | {"mass": -1e-3}), r"mechanics.mass = -0.001: must be .* kg"),
     (lambda: hr.Finger.still(mechanics=UNIT), r"mechanics.phalanx_mass = 0.001: must be 0"),
+    (lambda: NONE.skin_velocity_per_force(np.array([20.0])), "order = 0: must be 2 or 4"),
+    (lambda: LIGHT_SECOND.impedance(np.array([0.0])), r"frequency = .*: must be finite numbers > 0 Hz"),
+    (lambda: hr.Scene(texture=TONE, finger=[SLIDE, SLIDE], duration=1.0), "finger: 2 fingers are stated: must be one"),
+    (lambda: hr.Scene.from_toml_text(TWO_FINGERS), "finger: 2 fingers are stated: must be one"),
+    (lambda: fitted(standard_error=0 * IMPEDANCE.standard_error), "standard_error = 0.0: must be > 0 N s/m"),
+    (lambda: hr.fit_finger(IMPEDANCE, loads=(3.0, 9.0)), "0 different carriers with data at loads from 3 to 9 N"),
+    (lambda: hr.fit_finger(IMPEDANCE, loads=(1.0, 0.5)), "loads = .*: must be two loads in N"),
+    (lambda: hr.fit_finger(3), "impedance = 3: must be what analyse_finger returns"),
+    (lambda: fitted(3), "order = 3: must be 2, 4 or None"),
+    (lambda: fitted(2).interval("mass", 1), "level = 1: must be > 0 and < 1"),
+    (lambda: fitted(2).interval("tip"), "tip.*: must be one of mass, damping, stiffness, load_exponent"),
+    (lambda: analysed(sensed_channels=1), "1 sensors in m: must be 2 in m"),
+    (lambda: analysed(unit="N"), "2 sensors in N: must be 2 in m"),
+    (lambda: analysed(drive_channels=1), "1 drive channels: must be 2, one a coil"),
+    (lambda: analysed(rows=4999), "0.9998 s long: must be >= 1 s"),
+    (lambda: analysed(hr.DeviceProfile(kind="ultrasonic")), "profile.kind = 'ultrasonic': must be vt-plate"),
+    (lambda: analysed(3), "profile = 3: must be a DeviceProfile, PlateParameters, the path of"),
+    (lambda: analysed(block=2), "block=2 samples: must be an integer from 1 to the plate's delay, 1"),
+    (lambda: hr.analyse_finger("/a.h5"), "recording = '/a.h5': must be a Recording: see Recording.load"),
     (lambda: TriangleMotion(speed=-0.1), r"speed = -0.1: must be .* > 0 and <= 10 m/s"),
     (lambda: SineMotion(frequency=3.0), r"speed, stroke: exactly one must be given"),
     (lambda: Sampled(positions=[0.0, np.nan], rate=1.0), r"positions\[1\] = nan: must be a finite number"),
@@ -157,7 +249,7 @@ TRACKER = [
     (lambda: hr.FingerTracker(3), "plate = 3: must be a PlateParameters or a Course"),
     (lambda: tracker().update(0.0, 0.0), r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"),
     (
-        lambda: tracker(rate=500).update(np.zeros((5, 1)), np.zeros((5, 2))),
+        lambda: tracker().update(A_COLUMN, np.zeros((5, 2))),
         r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)",
     ),
 ]
@@ -165,19 +257,18 @@ PLANTS = [
     (lambda: PlateParameters.with_overrides({"mass": 0.0}), r"mass = 0.0: must be .*> 0 .*kg"),
     (lambda: PlateParameters.with_overrides({"masss": 1.0}), r"masss = 1.0: unknown key; known: .*mass"),
     (lambda: PlateParameters(bending_frequency=6000.0), r"bending_frequency = 6000.0: must be <= rate = 5000 Hz"),
-    (
-        lambda: Plate(PlateParameters(), hr.Finger.still(normal_load=0.5, mechanics=MASSLESS)),
-        r"phalanx_mass = 0.0 kg: must be .*> 0",
-    ),
+    (lambda: Plate(PlateParameters(), MASSLESS), r"phalanx_mass = 0.0 kg: must be .*> 0"),
     (lambda: Plate(PlateParameters(delay=2), SLIDE, block=3), r"block = 3: must be between 1 and the loop's delay of"),
+    (lambda: Plate(PlateParameters(), SLIDE).run(np.zeros((9, 1))), r"drive of shape \(9, 1\): must be \(samples, 2\)"),
+    (lambda: least_model(hr.Scene(texture=TONE, duration=1.0), tolerance=0.0), "tolerance=0.0: must be > 0 and <= 10"),
     (lambda: UltrasonicParameters(rate=48e3), r"rate = 48000.0: must be .*>= 66666.7 .*Hz for a carrier of 30000 Hz"),
     (
-        lambda: UltrasonicParameters(finger_damping=2000.0),
+        lambda: UltrasonicParameters(finger_damping=2e3),
         r"finger_damping = 2000.0: damping ratio 3.63 at 20 N .* must be .*<= 0.5",
     ),
     (
         lambda: UltrasonicParameters(**HOT),
-        r"temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
+        "temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
     ),
     (lambda: FitLaw(floor=1.0), r"floor = 1.0: must be .*<= 0.999"),
     (lambda: LoadSharing().ratio(1e-6, 0.0, 0.1), r"load = 0.0: must be .*> 0 .*N"),
@@ -190,39 +281,42 @@ SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
     (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
     (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
-    (
-        lambda: limited("vt-plate", peak=1.0),
-        "limits.peak = .*: unknown key; known: displacement, peak_drive, rms_drive",
-    ),
+    (lambda: limited("vt-plate", peak=1), "limits.peak = 1: unknown key; known: displacement, peak_drive, rms_drive"),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
     (lambda: plate(coils=3), "device.coils = 3: must be .* <= 2"),
     (lambda: opened("electroadhesion", finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.0"),
-    (
-        lambda: hr.prepare(friction_tone(100.0, force=2.0)),
-        r"asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal",
-    ),
-    (
-        lambda: hr.prepare(
-            hr.Scene(texture=TONE, finger=SLIDE, device="electroadhesion", duration=1.0, gradient=1.0),
-        ),
-        r"gradient = 1.0: must be 0 1/m",
-    ),
+    (lambda: hr.prepare(STRONG), "asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
+    (lambda: hr.prepare(replace(STRONG, gradient=1.0)), "gradient = 1.0: must be 0 1/m"),
     (lambda: opened("electroadhesion", force_range=1e-3), "friction of 0.3.. N: must be <= 0.001 N, the tribometer's"),
     (lambda: opened("electroadhesion", friction_coefficient=0.0), "device.friction_coefficient = 0.0: must be .* > 0"),
     (lambda: opened("ultrasonic", bias=0.1), r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
     (lambda: opened("ultrasonic", scale=1e-4), "asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
     (lambda: opened("ultrasonic", finger=hr.Finger.still(normal_load=0.4)), r"must slide faster than 0.001 m/s"),
     (lambda: opened("ultrasonic", finger=hr.Finger.absent()), r"must slide faster|normal_load = 0"),
-    (
-        lambda: opened("ultrasonic", hr.Grating(frequency=100.0, velocity=0.2)),
-        r"0.313 N of friction: must be <= 0.144 N",
+    (lambda: opened("ultrasonic", FAST), "0.313 N of friction: must be <= 0.144 N"),
+    *(
+        (lambda device=device: opened(device, RECORDED, velocity_per_force=0.0), "must be > 0 .* for a recording")
+        for device in ("electroadhesion", "ultrasonic")
     ),
+    *(
+        (lambda device=device: opened(device, finger=BARE, velocity_per_force=0.0), "finger.mechanics")
+        for device in ("electroadhesion", "ultrasonic")
+    ),
+    (lambda: sweep([TONE], at_a_time=0), "at_a_time = 0: must be an integer >= 1 scenes"),
+    (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
+    (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
+    (lambda: rendered(Own(lambda time, x: time[:-1])), r"Own.waveform returned float64 of shape \(\d+,\): must be"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
     (lambda: opened("hybrid", current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
     (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5)), "a recording over time is not supported"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]
 DRIVERS = [
+    (lambda: rendered(driver=SimulatedDriver), "driver = SimulatedDriver: must be an instance, not the class"),
+    (lambda: protocol.encode(protocol.Frame(1, 0, bytes(250))), "payload of 250 bytes: must be <= 249"),
+    (lambda: RealtimeEntry(object()), "controller of type object: must have a compiled step"),
+    (lambda: entry().finger(0.0, np.nan), "must be finite"),
+    (lambda: entry().set_gain(np.nan), "gain = nan"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
     (lambda: driver(block=0), r"block=0 must be a whole number >= 1"),
     (lambda: driver(sensed_channels=-1), r"sensed_channels=-1 must be a whole number >= 0"),
@@ -244,29 +338,26 @@ DRIVERS = [
     (lambda: BoardClient("x", timeout=-1e-9), r"timeout = .*: must be a finite number >= 0 s"),
     (lambda: BoardClient("x", reconnect=np.inf), r"reconnect = .*: must be a finite number >= 0 s"),
     (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 100e3})),
-        r"driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz",
+        lambda: on_users("ultrasonic", rate=100e3),
+        "driver.rate = 100000.0: must be a whole multiple of device.rate = 12000 Hz",
     ),
+    (lambda: on_users("ultrasonic", rate=48e3, block=4), "rate = 48000.0: must be >= 66666.7 Hz for a carrier"),
+    (lambda: on_users("ultrasonic", {"sensor": "tribometer"}), "device.sensor = 'tribometer': must be 'amplitude'"),
     (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS | {"rate": 48e3, "block": 4})),
-        r"rate = 48000.0: must be >= 66666.7 Hz for a carrier",
+        lambda: on_users(*TO_CARRIER, **SLOW),
+        "driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
     ),
-    (
-        lambda: opened("ultrasonic", driver=BaseDriver(**USERS), sensor="tribometer"),
-        r"device.sensor = 'tribometer': must be 'amplitude'",
-    ),
-    (
-        lambda: opened("electroadhesion", driver=BaseDriver(**BLIND | {"rate": 79_999}), output="carrier"),
-        r"driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
-    ),
-    (
-        lambda: opened("electroadhesion", driver=BaseDriver(**USERS), output="carrier"),
-        r"driver.sensed_channels = 1: must be 0 where output = 'carrier'",
-    ),
+    (lambda: on_users(*TO_CARRIER), "driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
     (lambda: opened("hybrid", driver=driver(rate=10e3)), r"driver.drive_channels = 2: must be 3"),
 ]
 DESIGNS = [
     (lambda: method_named("papper"), r"method = 'papper': must be one of paper, paper-common"),
+    (lambda: Resonant(gain=17.0).design(MODEL, make_bands(47.0, 1e-5)), r"gain=17 1/s must be below 16\.1 1/s"),
+    *(
+        (lambda method=method: played_late(method), "margin|unstable|sensitivity")
+        for method in ("boxcar", "static", "stiffness", "resonant")
+    ),
+    (lambda: in_blocks().run(*map(np.zeros, ((30, 2), 30, 30))), "30 samples: must be a multiple of the block of 25"),
     (lambda: demodulator(frequency=[]), "at least one number"),
     (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
     (lambda: demodulator(channels=0), "channels=0"),
@@ -275,15 +366,9 @@ DESIGNS = [
     (lambda: StarSTDFT(bandwidth=np.nan, rate=5000.0), "bandwidth=nan Hz must lie between"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
     (lambda: reduced_controller(-1.0, 5.0), "loop_bandwidth=-1.0 Hz: must be > 0 and below"),
-    (
-        lambda: exported(device="electroadhesion", texture=TONE, finger=SLIDE),
-        "device.kind = 'electroadhesion': a board plays vt-plate only",
-    ),
+    (lambda: board_design(hr.prepare(SCREEN), 0), "device.kind = 'electroadhesion': a board plays vt-plate only"),
     (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
-    (
-        lambda: exported(texture=hr.Synthetic(amplitude=20e-6, speed=0.08), finger=SLIDE),
-        "texture Synthetic: a board plays a whole waveform, without `carriers`",
-    ),
+    (lambda: exported(**BY_CARRIERS), "texture Synthetic: a board plays a whole waveform, without `carriers`"),
     (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),
     (lambda: exported(1), "bands = 1: must be 2 .* to 64"),
     (lambda: exported(65), "bands = 65: must be 2 .* to 64"),
@@ -299,3 +384,56 @@ EACH = [pytest.param(*row, id=f"{kind} {n}") for kind, rows in KINDS.items() for
 def test_what_cannot_be_is_refused(make, message):
     with pytest.raises((ValueError, TypeError, hr.DesignError), match=message):
         make()
+
+
+TEXTURE = hr.Grating(velocity=5e-3, frequency=100.0)
+FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4)
+ONE_EACH = {  # of every class of parameters that a kind of device reads from the table
+    "vt-plate": {"mass", "bending_frequency"},
+    "electroadhesion": {"velocity_per_force", "square_root", "headroom", "floor", "output", "current_limit", "rate"},
+    "ultrasonic": {"velocity_per_force", "square_root", "bias", "memory_length", "quality", "rate", "law"},
+    "hybrid": {"crossover", "velocity_per_force", "square_root", "mass", "screen_current_limit", "gap_thickness"},
+}
+
+
+def opened_on(device, **fields):
+    return prepare(hr.Scene(texture=TEXTURE, finger=FINGER, device=device, duration=2.0, **fields))
+
+
+def known_of(device):
+    """Names that the refusals of a misspelt one list."""
+    known = []
+    for field, table in (("simulation", "simulation"), ("rendering", "render")):
+        with pytest.raises(ValueError, match=rf"^{table}.mispelt = 1.0: unknown key; known: ") as refused:
+            opened_on(device, **{field: {"mispelt": 1.0}})
+        names = re.sub(r".*known: |; in a file also .*", "", str(refused.value)).split(", ")
+        assert names == sorted(set(names))
+        known += [(name, table) for name in names if name]
+    return {**dict(known), "rate": "device"}
+
+
+@pytest.mark.parametrize("device", ONE_EACH)
+def test_every_name_is_listed_once_in_order_and_accepted(device):
+    """A value is refused for what it is, never for its name: all parameters are numbers or options of a few."""
+    known = known_of(device)
+    assert set(known) >= ONE_EACH[device]
+    for name, table in known.items():
+        field = "rendering" if table == "render" else "simulation" if name in LEVEL else "profile"
+        with pytest.raises((TypeError, ValueError), match="must be") as refused:
+            opened_on(device, **{field: {name: "no such option"}})
+        assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such option'", str(refused.value))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"rendering": {"mass": 0.03}}, r"render.mass: belongs in \[device\] or \[simulation\]"),
+        ({"profile": {"finger_dynamics": 0}}, r"device.finger_dynamics: belongs in \[simulation\]"),
+        ({"simulation": {"rate": 1e4}}, r"simulation.rate: belongs in \[device\]"),
+        ({"device": "electroadhesion", "profile": {"headroom": 2.0}}, r"device.headroom: belongs in \[render\]"),
+        ({"device": "hybrid", "simulation": {"crossover": 90.0}}, r"simulation.crossover: belongs in \[render\]"),
+    ],
+)
+def test_a_parameter_in_the_wrong_table_is_sent_to_the_right_one(fields, message):
+    with pytest.raises(ValueError, match=message):
+        opened_on(**{"device": "vt-plate", **fields})

@@ -6,22 +6,7 @@ from dataclasses import replace
 import board
 import numpy as np
 import pytest
-from board import (
-    FINGER,
-    RATE,
-    ROOT,
-    SANITISED,
-    SCENE,
-    SteppedBoard,
-    build_board,
-    client_of,
-    driver_of,
-    program_of,
-    run,
-    sensed_error,
-    simulated_as,
-    tones,
-)
+from board import FINGER, RATE, ROOT, SCENE, SteppedBoard, build_board, program_of, sensed_error, simulated_as, tones
 
 import hapticrender as hr
 from hapticrender.cli import main
@@ -36,22 +21,22 @@ ROUNDING = 2.0**-24  # relative, of float32
 
 @pytest.fixture
 def stepped(tmp_path):
-    with SteppedBoard(program_of(*SANITISED), tmp_path) as board:
+    with SteppedBoard(tmp_path) as board:
         yield board
 
 
 @pytest.fixture
 def fast(tmp_path):
     """The same without sanitisers."""
-    with SteppedBoard(program_of("-O2"), tmp_path) as board:
+    with SteppedBoard(tmp_path, program=program_of("-O2")) as board:
         yield board
 
 
 @pytest.mark.parametrize("noise", [1e-6, 1e-7])
 def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, noise):
     """The board's own plate against the library's, under a finger that moves as the board says it did."""
-    with SteppedBoard(program_of("-O2"), tmp_path, options=("--noise", str(noise))) as board:
-        played = hr.render(SCENE, driver=driver_of(board, finger=FINGER))
+    with SteppedBoard(tmp_path, "--noise", str(noise), program=program_of("-O2")) as board:
+        played = hr.render(SCENE, driver=board.driver(finger=FINGER))
     simulated = simulated_as(played, SCENE, noise)
     on_board, in_library = sensed_error(played), sensed_error(simulated)
     of_noise = noise / np.sqrt(2) * np.sqrt(480 / (RATE / 2)) / (10e-6 / np.sqrt(2))
@@ -63,7 +48,7 @@ def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, 
 
 
 def test_a_scene_that_no_board_can_play_is_refused(stepped):
-    driver = driver_of(stepped)
+    driver = stepped.driver()
     with pytest.raises(DriverError, match="exchange: method 'h2' of this scene cannot run on a board"):
         hr.render(SCENE, driver=driver, method="h2")
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
@@ -71,7 +56,7 @@ def test_a_scene_that_no_board_can_play_is_refused(stepped):
 
 
 def test_textures_gain_and_finger_change_while_it_plays(stepped):
-    client = client_of(stepped).open()
+    client = stepped.client().open()
     client.set_bands(tones(47.0, amplitude=10e-6))
     client.limits(0.5)
     client.finger(0.01, 0.0, 0.4)
@@ -81,7 +66,7 @@ def test_textures_gain_and_finger_change_while_it_plays(stepped):
         change()
         for _ in range(10):
             client.finger(0.01, 0.0, 0.4)
-            run(client, stepped, 0.05)
+            stepped.run(client, 0.05)
         found.append(client.telemetry())
     assert [telemetry.state for telemetry in found] == 3 * [State.PLAYING]
     assert [[abs(band.target) for band in each.bands] for each in found] == [
@@ -97,7 +82,7 @@ def test_textures_gain_and_finger_change_while_it_plays(stepped):
         assert 0 < telemetry.cycles < telemetry.cycles_most
     assert found[2].commits == 2
     client.stop()
-    run(client, stepped, 0.1)
+    stepped.run(client, 0.1)
     assert client.telemetry()[4:6] == (State.IDLE, Cause.COMMAND)
     client.close()
     with pytest.raises(DriverError, match="it is not open"):
@@ -105,7 +90,7 @@ def test_textures_gain_and_finger_change_while_it_plays(stepped):
 
 
 def test_refusals_name_port_command_and_bytes(stepped):
-    client = client_of(stepped).open()
+    client = stepped.client().open()
     client.limits(client.capabilities.drive_limit)
     with pytest.raises(DriverError, match=r"stepped: START: refused by the board: state \(00 00 64 00\)"):
         client.start()
@@ -124,10 +109,10 @@ def test_refusals_name_port_command_and_bytes(stepped):
 def test_the_board_identifies_itself(tmp_path):
     """Drive as the lines say, and sensed what the device model makes of it."""
     lines = [Line(0, 60.0, 0.05), Line(1, 110.0, 0.05, 0.25)]
-    with SteppedBoard(program_of("-O2"), tmp_path, options=("--noise", "1e-8")) as board:
-        client = client_of(board).open()
+    with SteppedBoard(tmp_path, "--noise", "1e-8", program=program_of("-O2")) as board:
+        client = board.client().open()
         rows = client.identify(lines, 1.0)
-        run(client, board, 0.1)
+        board.run(client, 0.1)
         assert client.telemetry().cause == Cause.DONE
     drive, sensed = rows[:, :2], rows[:, 2:]
     assert rows.shape == (5000, 4)
@@ -153,7 +138,7 @@ def test_the_board_identifies_itself(tmp_path):
 def test_the_command_identifies_the_plate_of_a_board(fast, tmp_path, monkeypatch):
     """By drive from the host; the profile has the delay of the board's own loop, for which a design is exported."""
     expected, path = PlateParameters(), tmp_path / "plate.toml"
-    monkeypatch.setattr(board, "board_under_test", lambda: driver_of(fast), raising=False)
+    monkeypatch.setattr(board, "board_under_test", lambda: fast.driver(), raising=False)
     command = ["identify", "--driver", "board:board_under_test", "--amplitude", "50e-6", "--out", str(path)]
     assert main(command) == 0
     found = hr.DeviceProfile.load(path)
@@ -173,7 +158,7 @@ def test_a_run_goes_on_with_a_flag_after_its_board_was_lost(fast):
             fast.pulled = fast.time + 0.7
 
     fast.sleep = pull
-    with driver_of(fast, reconnect=5.0) as driver:
+    with fast.driver(reconnect=5.0) as driver:
         recording = hr.render(scene, driver=driver)
     assert driver.client.reconnections == 1
     lost = np.flatnonzero(recording.read("flags") & hr.Flag.OVERRUN)
@@ -198,11 +183,11 @@ def test_nothing_there_and_nothing_that_answers(tmp_path):
 
 def test_more_bands_than_a_frame_holds(tmp_path):
     program = build_board(tmp_path / "firmware", hr.prepare(SCENE), "-O1", "-DREAL_DOUBLE", bands=20)
-    with SteppedBoard(program, tmp_path) as board:
-        client = client_of(board).open()
+    with SteppedBoard(tmp_path, program=program) as board:
+        client = board.client().open()
         client.set_bands(tones(*range(40, 340, 20), amplitude=1e-6))
         client.start()
-        run(client, board, 0.1)
+        board.run(client, 0.1)
         found = client.telemetry()
         assert len(found.bands) == found.total == 15
         assert [abs(band.target) for band in found.bands] == pytest.approx(15 * [1e-6], rel=ROUNDING)
@@ -213,12 +198,12 @@ def test_more_bands_than_a_frame_holds(tmp_path):
 )
 def test_what_the_line_carries_is_what_the_page_says(fast, stream, period, received):
     """Bytes a second of the stream alone, of every tenth row, and of the telemetry of 8 bands; words besides."""
-    client = client_of(fast).open()
+    client = fast.client().open()
     client.set_bands(tones(*range(40, 280, 30), amplitude=1e-6))
     client.start(stream=stream, telemetry=period)
-    run(client, fast, 0.2)
+    fast.run(client, 0.2)
     before = client._line.received_bytes, client._line.sent_bytes
-    run(client, fast, 1.0)
+    fast.run(client, 1.0)
     found = client._line.received_bytes - before[0], client._line.sent_bytes - before[1]
     assert found[0] == pytest.approx(received, rel=0.02)
     assert found[1] == pytest.approx(1900, rel=0.02)

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.signal import firwin, lfilter
+from other_plate import REACH, OtherPlate
 from strangers_plate import WRONG, StrangersPlate
-from two_fingers import HEAVY, LIGHT, TwoFingers
+from waves import white
 
 import hapticrender as hr
 from benchmarks.panels import PANELS
@@ -18,14 +18,45 @@ from hapticrender.analysis.two_touches import (
 )
 from hapticrender.touch.touch_panel import PanelReader
 
+LIGHT, HEAVY = (0.2e-3, 1.5, 1e3, 4e-3, 1.0, 200.0), (0.2e-3, 8.0, 8e3, 4e-3, 1.5, 300.0)  # Table 1 of the paper
 RATE, PAIR = 5000.0, ((HEAVY, -20e-3, 0.8, 0.6, 1.9), (HEAVY, 20e-3, 0.8, 1.0, 1.9))
 
 
+class TwoFingers(OtherPlate):
+    """Fingers are (mechanics, position m, load N, on s, off s); the position of the first one is reported, or `place`.
+
+    `senses` False leaves the controller without sensors.
+    """
+
+    probe, touching = False, None
+
+    def __init__(self, *fingers, place=None, senses=True):
+        super().__init__()
+        self.fingers, self.times = [each[:3] for each in fingers], [each[3:] for each in fingers]
+        self.place, self.sensed_channels, self.motion = place, 2 * senses, []
+        self._state = np.zeros(4 + 2 * len(fingers))
+
+    def play(self, drive):
+        touching = [on <= len(self.played) / RATE < off for on, off in self.times]
+        if touching != self.touching:
+            self.touching = touching
+            self._design(touching)
+        self.motion.append(self._state[0] + np.array([0.0, -REACH, REACH]) * self._state[1])
+        sensed, (_, place, load) = super().play(drive).sensed[:, : self.sensed_channels], self.fingers[0]
+        place = np.nan if not touching[0] else place if self.place is None else self.place
+        return hr.Sensed(sensed, np.array([place]), normal_load=np.array([touching[0] * load]))
+
+    def error(self, reference, start, stop):
+        """Deviation of the motion from the reference in the middle and at both ends, of the reference, rms."""
+        rows = slice(round(start * RATE), round(stop * RATE))
+        motion, wanted = np.array(self.motion)[rows], reference[rows]
+        return ((motion - motion.mean(axis=0)) - wanted[:, None]).std(axis=0) / wanted.std()
+
+
 @pytest.fixture
-def noise(rng):
+def noise():
     """White noise of 20-400 Hz, 5 um rms."""
-    samples = lfilter(firwin(401, [20, 400], pass_zero=False, fs=RATE), 1, rng.standard_normal(30_000))[401:]
-    return hr.Recorded(samples=samples, rate=RATE, amplitude=5e-6)
+    return hr.Recorded(samples=white(29_599, 5e-6), rate=RATE, gain=1.0)
 
 
 def wrong(position, told, kind=StrangersPlate):
@@ -135,13 +166,3 @@ def test_devices_without_force_and_moment_are_not_watched():
     assert not measures_moment(model.model)
     with pytest.raises(ValueError, match="1 coordinates: must be a plate with 2"):
         TouchMonitor(model.model)
-
-
-def test_a_scene_with_two_fingers_is_refused():
-    finger, texture = hr.Finger.still(0.01), hr.Grating(frequency=50.0, amplitude=1e-6)
-    with pytest.raises(ValueError, match="finger: 2 fingers are stated: must be one"):
-        hr.Scene(texture=texture, finger=[finger, finger], duration=1.0)
-    two = '[[finger]]\nmotion = "still"\n' * 2
-    text = f'duration = 1.0\n[texture]\nkind = "grating"\nfrequency = 50.0\namplitude = 1e-6\n{two}'
-    with pytest.raises(hr.SceneError, match="finger: 2 fingers are stated: must be one"):
-        hr.Scene.from_toml_text(text)

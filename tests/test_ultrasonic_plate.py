@@ -59,12 +59,7 @@ def test_poles(load, pole, settling, quality):
 
 @pytest.mark.parametrize(
     ("load", "offset", "percent", "degrees", "digits"),
-    [
-        (0.0, 10.0, -0.9, 7.6, 1),
-        (0.0, 30.0, -7, 22, 0),
-        (0.0, 150.0, -55, 63, 0),
-        (0.5, 60.0, -3, 13, 0),
-    ],
+    [(0.0, 10.0, -0.9, 7.6, 1), (0.0, 30.0, -7, 22, 0), (0.0, 150.0, -55, 63, 0), (0.5, 60.0, -3, 13, 0)],
 )
 def test_what_detuning_costs(load, offset, percent, degrees, digits):
     """1/(1 + j 2 Q df/f) at Q 200 and Q 60, to the last printed digit."""
@@ -125,15 +120,6 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
     assert abs(gain[0] / gain[1] - 1) <= abs(error) + left
     if abs(offset) >= 75:
         assert abs(error) > 5 * left  # so the comparison says something
-
-
-@pytest.mark.parametrize(("delay", "block"), [(1, 1), (4, 1), (4, 3)])
-def test_drive_acts_after_its_delay(delay, block):
-    plant = UltrasonicPlate(UltrasonicParameters(delay=delay, **IDEAL), FREE, block=block)
-    drive = np.zeros((12, 1))
-    drive[2] = 1.0
-    motion = plant.run(drive).motion[:, 0]
-    assert np.flatnonzero(motion)[0] == 2 + delay - block + 1
 
 
 def test_the_sensor_rounds_clips_and_has_its_noise():

@@ -1,19 +1,76 @@
 """Ultrasonic surfaces in closed loop: the amplitude on its resonance, and the friction that a scene asks for."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
+from live_devices import Told
 from scipy.signal import hilbert
 from tables import scene_on
-from ultrasonic import ASKED, NOISE, held, modulated, ran
 from waves import phasor, read_back
 
 import hapticrender as hr
-from hapticrender.drivers.simulated import SimulatedDriver
+from hapticrender.control.controller import BankController
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
-from hapticrender.protocols import Flag
+from hapticrender.protocols import Array, Flag
+from hapticrender.renderers.ultrasonic import amplitude_loop
+
+FREE = hr.Finger.absent()
+ASKED = 1e-6  # m
+NOISE = 5e-3  # of 1 um: the loop leaves 1.1 nm of the sensor's noise, at 4.5 sigma
+
+
+class Run(NamedTuple):
+    """What a plate under its amplitude loop did; envelopes by Hilbert's transform, which spoils both ends."""
+
+    time: Array
+    wanted: Array
+    amplitude: Array
+    drive: Array  # V
+    flags: Array
+    loop: BankController
+    mode: UltrasonicParameters
+
+    def between(self, start, end):
+        """The same from `start` to `end` (s)."""
+        part = slice(*(round(each * self.mode.rate) for each in (start, end)))
+        return Run(*(each[part] for each in self[:5]), self.loop, self.mode)
+
+    @property
+    def error(self):
+        """Amplitude error as a share of what is wanted."""
+        return self.amplitude / self.wanted - 1
+
+    def settled_after(self, tolerance):
+        """Time (s) from the first sample to the last one whose error is larger."""
+        wrong = np.flatnonzero(abs(self.error) > tolerance)
+        return (wrong[-1] + 1) / self.mode.rate if wrong.size else 0.0
+
+    @property
+    def longest_unlocked(self):
+        """Longest time (s) without lock."""
+        edges = np.flatnonzero(np.diff(np.r_[0, (self.flags & Flag.UNLOCKED) != 0, 0]))
+        return max(edges[1::2] - edges[::2], default=0) / self.mode.rate
+
+
+def held(load):
+    return hr.Finger.still(normal_load=load) if load else FREE
+
+
+def ran(wanted, seconds, finger=FREE, settings=None, **plant):
+    """The plate under its own loop; `wanted` (m) over time (s); `settings` of the loop that differ."""
+    parameters = SurfaceParameters.with_overrides(plant)
+    mode, loop = parameters.carrier_mode, amplitude_loop(parameters)
+    for name, value in (settings or {}).items():
+        loop.state["p"][name] = value
+    time = np.arange(round(seconds * mode.rate)) / mode.rate
+    asked = np.broadcast_to(np.asarray(wanted(time) if callable(wanted) else wanted, float), time.shape).copy()
+    drive, _, flags, sensed = UltrasonicPlate(mode, finger).closed_loop(loop, asked)
+    return Run(time, asked, abs(hilbert(sensed.motion[:, 0])), drive[:, 0], flags, loop, mode)
+
 
 LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
 
@@ -21,7 +78,8 @@ LEVELS = pytest.mark.parametrize("level", ["carrier", "envelope"])
 @pytest.mark.parametrize(("level", "load"), [("carrier", 0.0), ("carrier", 1.5), ("envelope", 0.5)])
 def test_modulation_at_400_hz_is_flat_with_the_stated_headroom(level, load):
     """Within 1 dB, at the drive of `drive_for`; the law leaves out m W^2 of a stiffness near 2 m w W, W/2w of it."""
-    run = ran(modulated(ASKED), 0.21, held(load), level=level).between(0.1, 0.2)
+    modulated = lambda t: ASKED * (1 + 0.5 * np.cos(2 * np.pi * 400.0 * t))  # noqa: E731
+    run = ran(modulated, 0.21, held(load), level=level).between(0.1, 0.2)
     gain = phasor(run.amplitude, 400.0, run.mode.rate) / (0.5 * ASKED)
     left = 400.0 / (2 * run.mode.carrier)
     assert 20 * abs(np.log10(abs(gain))) < 1.0
@@ -90,18 +148,9 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
     assert not recording.motion[away, 0].any()
 
 
-class Watched(SimulatedDriver):
-    """A resonant plate as a user's device: only the test gets its amplitude."""
-
-    def __init__(self, parameters, finger=SLIDE, block=1):
-        super().__init__(UltrasonicPlate(parameters, finger, block=block))
-        self.moved, self.played = [], []
-
-    def _play(self, drive):
-        sensed = super()._play(drive)
-        self.moved.append(sensed.motion[:, 0])
-        self.played.append(drive[:, 0].copy())
-        return sensed._replace(motion=None)
+def watched(finger=SLIDE, **tell):
+    """A resonant plate as a user's device, in blocks of 16: only the test gets its amplitude."""
+    return Told(UltrasonicPlate(UltrasonicParameters(delay=16), finger, block=16), **tell)
 
 
 def friction_of(moved, frequency, rate=192e3, load=0.4):
@@ -114,10 +163,10 @@ def friction_of(moved, frequency, rate=192e3, load=0.4):
 
 def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
     """A per cent in friction, with the lock on although it takes blocks."""
-    device = Watched(UltrasonicParameters(delay=16), block=16)
+    device = watched()
     session = prepare(scene(frequency=200.0, duration=0.42, settle=0.2), driver=device)
     recording = run(session)
-    assert friction_of(np.concatenate(device.moved), 200.0) == pytest.approx(WANTED, rel=PER_CENT)
+    assert friction_of(np.concatenate(device.moved)[:, 0], 200.0) == pytest.approx(WANTED, rel=PER_CENT)
     assert (session.driver.block, session.driver.delay) == (1, 1)
     shift = float(UltrasonicParameters().resonance(0.4)) - 30e3
     assert session.driver.loop.state["shift"][0] == pytest.approx(shift, abs=1.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from ultrasonic import ASKED, ran
+from test_ultrasonic_rendering import ASKED, ran
 
 import hapticrender as hr
 from hapticrender.accuracy import friction as accuracy_friction

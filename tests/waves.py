@@ -8,13 +8,13 @@ from hapticrender.bands import Bands
 
 
 class Own:
-    """A texture of one's own, played whole: a function of time (s) and position (m)."""
+    """A texture of one's own: a function of time (s) and position (m), played whole where no bands are given."""
 
-    def __init__(self, waveform, spatial=False):
-        self.waveform, self.spatial = waveform, spatial
+    def __init__(self, waveform, spatial=False, bands=None):
+        self.waveform, self.spatial, self._bands = waveform, spatial, bands
 
     def bands(self, rate):
-        return Bands.none(spatial=self.spatial)
+        return Bands.none(spatial=self.spatial) if self._bands is None else self._bands
 
 
 def phasor(signal, frequency, rate=5000.0):
