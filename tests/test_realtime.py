@@ -1,5 +1,6 @@
 """The compiled entry: called from a thread of C while Python keeps its lock, it does what the Python path does."""
 
+import copy
 import ctypes
 import sys
 import time
@@ -342,6 +343,17 @@ def test_what_it_refuses():
         entry.finger(0.0, np.nan)
     with pytest.raises(ValueError, match="gain = nan"):
         entry.set_gain(np.nan)
+
+
+def test_what_holds_addresses_is_not_copied():
+    """A copy would read and write the memory of the first."""
+    bank, scenes = controller(), hr.builtin_scenes()
+    texture = SampledTexture(hr.Grating(frequency=72.0, amplitude=1e-5), 5000.0)
+    own = [hr.prepare(scenes[name], compiled=False).controller() for name in ("grating-72", "one-texture-hybrid")]
+    for each in (bank, RealtimeEntry(bank), texture, *own):
+        for duplicate in (copy.copy, copy.deepcopy):
+            with pytest.raises(TypeError, match=rf"^{type(each).__name__}: cannot be copied or pickled"):
+                duplicate(each)
 
 
 def test_what_a_sampled_texture_refuses():
