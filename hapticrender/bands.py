@@ -117,7 +117,7 @@ class Bands:
         ValueError
             The first sample that is wrong, with its time and position.
         """
-        values = waveform(time, position)
+        values = waveform(np.array(time), np.array(position))  # which it may work in
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
             found = (
                 f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__

@@ -4,9 +4,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+from waves import Own
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS
+from hapticrender.touch import composed
 
 TIME = np.arange(0.0, 3.0, 1 / 5000)
 AWAY = np.full(TIME.size, np.nan)
@@ -77,6 +79,47 @@ def test_a_playlist_plays_each_from_its_beginning_and_starts_again():
 def test_a_scene_file_holds_them(texture):
     scene = hr.Scene(texture=texture, duration=1.0)
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene
+
+
+class InPlace:
+    """A texture and a motion of one's own: of the arrays that they are handed, or of copies of them."""
+
+    def __init__(self, spatial, copies):
+        self.spatial, self.take = spatial, np.copy if copies else np.asarray
+        self.bands = Own(None, spatial).bands
+
+    def waveform(self, time, position):
+        turns = self.take(position if self.spatial else time)
+        turns *= 1000.0 if self.spatial else 100.0
+        return 5e-6 * np.sin(2 * np.pi * turns)
+
+    def position(self, time):
+        place = self.take(time)
+        place *= 0.08
+        return place
+
+    load = position
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_what_is_handed_to_a_users_code_is_a_copy(spatial):
+    """A texture that works in place changed that of the next part, what was recorded and constants of the module."""
+    readings, found = composed.READINGS.copy(), []
+    for copies in (False, True):
+        own = InPlace(spatial, copies)
+        texture = hr.Sum([(own, 1.0), (RIDGES if spatial else TONE, 0.5)])
+        time = TIME.copy()
+        waveform = texture.waveform(time, time)
+        assert np.array_equal(time, TIME)
+        run = hr.render(hr.Scene(texture=texture, finger=hr.Finger(own, None), duration=0.5))
+        with hr.Player(paced=False) as player:
+            player.play(texture)
+            player.play(own)
+            player.sleep(0.1)
+        found.append([waveform, run.position, run.normal_load, run.reference, run.drive])
+    assert np.array_equal(composed.READINGS, readings)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_part_that_is_no_texture_is_named():

@@ -182,7 +182,8 @@ class Sum(Validated, _Composed):
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)) at `time` (s) with the finger at `position` (m)."""
-        return np.sum([gain * texture.waveform(time, position) for texture, gain in self.parts], axis=0)
+        values = [gain * texture.waveform(np.array(time), np.array(position)) for texture, gain in self.parts]
+        return np.sum(values, axis=0)
 
 
 @dataclass(frozen=True)
