@@ -11,8 +11,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``delay``
     samples from the moment that a sample is sensed to the moment that the drive computed from it acts, >= `block`
 ``play(drive)``
-    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples; a device
-    waits here until the block is due
+    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples, in arrays
+    that it may use again; a device waits here until the block is due
 ``__enter__``, ``__exit__``
     makes the device ready, and leaves it at rest with zero drive whatever has happened
 ``zero_on_exit`` (optional)
