@@ -33,6 +33,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``start(entry)``, ``stop()`` (optional)
     of a device that calls back: hands it a ``hapticrender.realtime_entry.RealtimeEntry``, with ``sensed_scale`` (m) and
     ``drive_scale`` (1/A) of full scale; its ``check()`` (optional) raises what went wrong meanwhile
+``cpu_load`` (optional)
+    float: share of its time that a callback takes, 1 is all; NaN where it is not known; shown by ``Player.state()``
 ``loop(rendering)`` (optional)
     of a device with a controller of its own: what it plays live, like ``hapticrender.live_loop.LiveLoop``
 ``exchange(controller)`` (optional)
