@@ -143,6 +143,29 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert not (tmp_path / "out" / "sensed.wav").exists()
 
 
+@pytest.mark.parametrize("ending", [".wav", ".w64"])
+def test_a_drive_replaces_its_own_file_and_by_force_any_but_the_texture(run, tmp_path, ending):
+    """A W64 file has no room to say whose it is."""
+    played, scene = tmp_path / f"mine{ending}", tmp_path / "scene.toml"
+    soundfile.write(played, np.sin(np.arange(4000) / 10.0), 5000, subtype="DOUBLE")
+    tone = 'kind = "grating", frequency = 47.0, amplitude = 1e-5'
+    file = f'kind = "sum", parts = [[{{kind = "recorded", file = "{played.name}", amplitude = 1e-5}}, 1.0]]'
+    again = "" if ending == ".wav" else "no file of this driver"
+    for texture, force, words in (
+        (file, ["--force"], "would overwrite the scene's texture"),
+        (tone, [], "no file of this driver"),
+        (tone, ["--force"], ""),
+        (tone, [], again),
+    ):
+        before = played.read_bytes()
+        duration = 0.3 if force else 0.4
+        scene.write_text(f"duration = {duration}\ntexture = {{{texture}}}\n[render]\nsettle = 0.1\n")
+        status, _, error = run("render", scene, "--out", tmp_path / "out", "--driver", f"wavefile:{played}", *force)
+        assert status == (2 if words else 0), error
+        assert words in "".join(error)
+        assert (played.read_bytes() == before) == bool(words)
+
+
 @pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
 @pytest.mark.parametrize("method", ["__enter__", "play"])
 def test_what_a_driver_raises_is_one_line_with_its_name(run, tiny, tmp_path, monkeypatch, verb, method):

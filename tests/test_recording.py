@@ -134,15 +134,56 @@ def test_a_killed_process_leaves_all_but_its_last_quarter_second(tmp_path):
 
 def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
     path = tmp_path / "run.au"
-    path.write_bytes(b"older")
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**{name: values[:5] for name, values in signals.items()})
+    older = path.read_bytes()
     with pytest.raises(RuntimeError, match="bad input"), make_recorder(path, bands):
         raise RuntimeError("bad input")
-    assert path.read_bytes() == b"older"
+    assert path.read_bytes() == older
     with make_recorder(path, bands) as recorder:
         with pytest.raises(ValueError, match=r"drive has shape \(2500, 1\), expected 2500 samples, 2 columns"):
             recorder.append(**signals | {"drive": signals["drive"][:, :1]})
-        assert path.read_bytes() == b"older"
+        assert path.read_bytes() == older
         recorder.append(**signals)
+    assert len(Recording.load(path)) == 2500
+
+
+@pytest.mark.parametrize(("held", "refused"), [(b"notes of mine", True), (b".snd" + bytes(99), True), (b"", False)])
+def test_what_is_no_journal_is_not_replaced(bands, tmp_path, held, refused):
+    path = tmp_path / "mine.au"
+    path.write_bytes(held)
+    if refused:
+        with pytest.raises(
+            ValueError, match=r"mine\.au: is there and no recording of this library: choose another name"
+        ):
+            make_recorder(path, bands)
+        assert path.read_bytes() == held
+    else:
+        with make_recorder(path, bands) as recorder:
+            recorder.begin()
+
+
+def test_a_damaged_or_older_journal_is_replaced(recording, bands, signals, tmp_path):
+    path = tmp_path / "run.au"
+    recording.save(path)
+    path.write_bytes(path.read_bytes()[:200].replace(b'"version": 2', b'"version": 1'))
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**signals)
+    assert_same(recorder.finish(), recording)
+
+
+def test_a_journal_that_is_being_written_is_not_replaced(recording, bands, signals, tmp_path):
+    path = tmp_path / "live.au"
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**signals)
+        read, words = Recording.load(path), "is being recorded: end that first"
+        for act in (lambda: read.save(path), lambda: recording.save(path), make_recorder(path, bands).begin):
+            with pytest.raises(ValueError, match=words):
+                act()
+        read.save(tmp_path / "other.au")
+        recorder.append(**signals)
+    assert len(recorder.finish()) == 5000
+    read.save(path)
     assert len(Recording.load(path)) == 2500
 
 

@@ -51,7 +51,7 @@ class Recorder:
     Raises
     ------
     ValueError, TypeError
-        The path does not end in .au, or a field is out of its bounds.
+        The path does not end in .au, a file of that name is no journal, or a field is out of its bounds.
     """
 
     def __init__(
@@ -65,6 +65,8 @@ class Recorder:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
             raise ValueError(f"{self.path}: a journal is a Sun AU file, its name must end in .au")
+        if self.path is not None:
+            journal.refuse_others(self.path)
         self.header = Header.of(scene, **header)
         self._scene, self._requested = scene, requested
         self._done, self._before = 0, np.full(2, np.nan)  # samples with a reference; the finger's last positions (m)
@@ -103,8 +105,10 @@ class Recorder:
     def begin(self) -> None:
         """Make the file of `path` now, not at the first block; an OSError states why it cannot be written."""
         path = Path(self.path or "")
+        journal.refuse_open(path)
         path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
         self._file = path.open("xb")
+        journal.OPEN[os.path.realpath(path)] = self._file
 
     def flush(self) -> None:
         """Hand everything appended so far to the operating system; without a path, do nothing."""

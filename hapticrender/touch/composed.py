@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -44,6 +45,15 @@ def lies_along_surface(texture: Texture) -> bool:
     """Whether a texture is read at the finger's position: its `spatial` says so; without that, its bands do."""
     stated = getattr(texture, "spatial", None)
     return bool(texture.bands(NOMINAL_RATE).follows_finger if stated is None else stated)
+
+
+def refuse_to_overwrite(texture: Texture, path: Any) -> None:
+    """Refuse to write to `path` where a texture, or a part of it, is read from that file."""
+    for part, _ in texture.parts if isinstance(texture, _Composed) else ():
+        refuse_to_overwrite(part, path)
+    files: tuple[Any, Any] = getattr(texture, "file", None), path
+    if all(isinstance(each, str | os.PathLike) and os.path.exists(each) for each in files) and os.path.samefile(*files):
+        raise ValueError(f"{path}: would overwrite the scene's texture: choose another name")
 
 
 class SeparatedTexture:
