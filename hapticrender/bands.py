@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,11 @@ class Bands:
                 column: Array = np.asarray(getattr(self, name), kind)
                 object.__setattr__(self, name, column)
                 _check(name, column, self.frequency.shape, unit, least)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether it is of the same type, with the same numbers."""
+        names = [entry.name for entry in fields(self)]
+        return type(self) is type(other) and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in names)
 
     def __len__(self) -> int:
         return len(self.frequency)

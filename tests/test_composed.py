@@ -122,6 +122,31 @@ def test_what_is_handed_to_a_users_code_is_a_copy(spatial):
         np.testing.assert_array_equal(one, other)
 
 
+def test_bands_are_equal_by_their_numbers():
+    one, other = (TONE + RIDGES).bands(5000.0), (TONE + RIDGES).bands(5000.0)
+    assert one == other
+    assert one in [other]
+    louder = (TONE + 2 * RIDGES).bands(5000.0)
+    for different in (louder, TONE.bands(5000.0), hr.Bands.none(spatial=True), 2 * one.envelope, None):
+        assert one != different
+    assert hr.Bands.none(spatial=True) != hr.Bands.none(spatial=False)
+    scene = hr.Scene(texture=TONE, duration=0.1)
+    runs = [
+        hr.Recorder(None, scene=scene, method="h2", seed=0, rate=5000.0, bands=each) for each in (one, other, louder)
+    ]
+    assert runs[0].header == runs[1].header != runs[2].header
+
+
+def test_what_holds_signals_is_equal_to_itself_alone():
+    blocks, scene = [hr.Sensed(np.zeros((2, 2)), np.zeros(2)) for _ in range(2)], hr.builtin_scenes()["grating-47"]
+    models = [hr.prepare(scene, compiled=False).model for _ in range(2)]
+    for one, other in (blocks, models):
+        assert one == one  # noqa: PLR0124
+        assert one != other
+        assert one in [other, one]
+        assert one not in [other]
+
+
 def test_a_part_that_is_no_texture_is_named():
     text = hr.Scene(texture=TONE + CHIRP, duration=1.0).to_toml().replace("chirp", "chimp")
     with pytest.raises(hr.SceneError, match=r"texture\.parts\[1\]\[0\]\.kind = 'chimp': must be one of"):

@@ -23,7 +23,7 @@ from hapticrender.jit import C16, F8, I8, SIGNALS_T, Addressed, addresses, call,
 from hapticrender.protocols import Array, Method
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CombinedModel(DeviceModel):
     """Device model of a device of two parts, which have a model and a controller each."""
 
@@ -32,7 +32,7 @@ class CombinedModel(DeviceModel):
     velocity_per_force: float  # m/(N s): skin velocity that feels as strong as a newton of friction
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CombinedBands(Bands):
     """Bands of a device of two parts, their envelopes the target displacement (m), and the share of each part."""
 
