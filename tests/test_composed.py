@@ -122,6 +122,25 @@ def test_what_is_handed_to_a_users_code_is_a_copy(spatial):
         np.testing.assert_array_equal(one, other)
 
 
+def test_textures_are_added_and_subtracted():
+    class Mine(Own):
+        """One of one's own, without operators."""
+
+    mine = Mine(lambda time, position: 1e-6 * np.sin(time))
+    a, b = TONE.waveform(TIME, AWAY), CHIRP.waveform(TIME, AWAY)
+    for texture, expected in (
+        (sum([TONE, CHIRP]), a + b),
+        (TONE - CHIRP, a - b),
+        (TONE - (CHIRP - 0.5 * TONE), 1.5 * a - b),
+        (-TONE, -a),
+        (TONE - mine, a - 1e-6 * np.sin(TIME)),
+    ):
+        np.testing.assert_allclose(texture.waveform(TIME, AWAY), expected, atol=1e-18)
+    for act in (lambda: TONE - 1, lambda: 1 + TONE, lambda: 1 - TONE, lambda: sum([TONE], 1.0)):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            act()
+
+
 def test_bands_are_equal_by_their_numbers():
     one, other = (TONE + RIDGES).bands(5000.0), (TONE + RIDGES).bands(5000.0)
     assert one == other

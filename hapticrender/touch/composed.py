@@ -26,7 +26,7 @@ Parts = tuple[tuple[Texture, float], ...]
 
 
 class Composable:
-    """Base of the library's textures: ``a + b`` and ``0.5 * a`` are `Sum`s."""
+    """Base of the library's textures: ``a + b``, ``a - b``, ``0.5 * a`` and ``sum([a, b])`` are `Sum`s."""
 
     def __add__(self, other: Any) -> Sum:
         return Sum((*_terms(self), *_terms(other))) if isinstance(other, Texture) else NotImplemented
@@ -35,6 +35,15 @@ class Composable:
         return Sum(tuple((each, gain * own) for each, own in _terms(self)))
 
     __rmul__ = __mul__
+
+    def __neg__(self) -> Sum:
+        return self * -1.0
+
+    def __sub__(self, other: Any) -> Sum:
+        return self + -Sum(_terms(other)) if isinstance(other, Texture) else NotImplemented
+
+    def __radd__(self, other: Any) -> Any:  # the 0 that `sum` begins with
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 def _terms(texture: Any) -> Parts:
