@@ -253,6 +253,23 @@ def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     assert len(str(refused.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"name": "drive", "step": 0}, ValueError, "step = 0: must be an integer >= 1 samples"),
+        ({"name": "drive", "step": -2}, ValueError, "step = -2: must be an integer >= 1 samples"),
+        ({"name": "drive", "step": 1.5}, TypeError, "step = 1.5: must be an integer"),
+        ({"name": "foo"}, ValueError, "name = 'foo': must be one of drive, sensed, motion, position, normal_load, "),
+    ],
+)
+def test_what_cannot_be_read_is_named(recording, tmp_path, arguments, error, message):
+    recording.save(tmp_path / "run.au")
+    for each in (recording, Recording.load(tmp_path / "run.au")):
+        with pytest.raises(error, match=message):
+            each.read(**arguments)
+        assert len(each.read("drive", 0, 10, 3)) == 4
+
+
 @pytest.mark.parametrize("suffix", [".wav", ".flac"])
 def test_sound_for_listening_states_its_scale_and_is_silent_where_it_is_no_number(tmp_path, suffix):
     wave = np.r_[0.3 * np.sin(0.1 * np.arange(1000)), np.nan, np.inf][:, None]

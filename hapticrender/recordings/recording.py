@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
@@ -255,6 +256,8 @@ class Recording:
 
         `name` is "drive", "sensed", "motion", "position", "normal_load", "flags", "reference" or "target".
         """
+        require(name in self.header.slices, "name", name, f"one of {', '.join(self.header.slices)}")
+        step = integer("step", step, "samples", least=1)
         if isinstance(self.frames, np.ndarray):
             return journal.column(self.header, self.frames[start:stop:step], name)
         columns = len(self.header.channels)
