@@ -54,6 +54,8 @@ def test_a_failing_scene_is_named(threads):
     executor = ThreadPoolExecutor(threads) if threads else None
     with pytest.raises(SweepError, match=r"^scenes\[1\] \('too much'\): ValueError: texture.amplitude = 0.001 m"):
         sweep(scenes, worst_error, executor=executor)
+    with pytest.raises(TypeError, match="scenes = Scene.*: must be scenes, in a list"):
+        sweep(SCENES[-1])
     with pytest.raises(ValueError, match="at_a_time = 0: must be an integer >= 1 scenes"):
         sweep(scenes, at_a_time=0)
 
