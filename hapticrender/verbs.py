@@ -310,6 +310,8 @@ def latency(arguments: argparse.Namespace) -> int:
     driver = open_driver(arguments.driver)
     if driver is None:
         raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    if hasattr(driver, "driven_by_host"):
+        raise ValueError(f"--driver = {arguments.driver!r}: the loop runs on the board, whose design states its delay")
     with naming_driver(arguments.driver):
         found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
     print(printable(f"{arguments.driver}: {found}"))

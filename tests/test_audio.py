@@ -299,10 +299,19 @@ def test_the_delay_is_written_into_a_profile(tmp_path):
     assert tomllib.loads(path.read_text()) == tomllib.loads(before) | {"calibration": expected}
 
 
+class Hosted:
+    """A board, as far as the verb looks."""
+
+    def driven_by_host(self):
+        raise NotImplementedError
+
+
 def test_the_verb_refuses_what_has_no_cable(capsys, tmp_path):
     assert main(["latency", "--driver", "simulated"]) == 2
     assert "must be a device with a cable, such as audio:0" in capsys.readouterr().err
     assert main(["latency", "--driver", f"wavefile:{tmp_path / 'drive.wav'}"]) == 2
     assert "senses nothing: a round trip needs an input" in capsys.readouterr().err
+    assert main(["latency", "--driver", "test_audio:Hosted"]) == 2
+    assert "the loop runs on the board, whose design states its delay" in capsys.readouterr().err
     assert main(["latency", "--driver", "audio:no such card"]) == 2
     assert "audio:" in capsys.readouterr().err
