@@ -47,3 +47,11 @@ def test_python_on_the_page_about_the_finger_runs(tmp_path, monkeypatch):
     analyse = names["hr"].analyse_finger
     assert analyse(names["theirs"]).of_kind(2) == names["found"].of_kind(2)
     assert len(names["touch"].time) == 50
+
+
+def test_python_on_the_page_about_devices_runs():
+    """The last position is estimated no farther off than the finger has moved."""
+    names = {"__name__": "devices"}
+    [block] = re.findall(r"^```python\n(.*?)^```", (ROOT / "docs" / "devices.md").read_text("utf-8"), re.M | re.S)
+    exec(compile(block, "devices.md, Python block", "exec"), names)
+    assert abs(names["found"].position - 0.0108) < 0.0108 - 0.0100
