@@ -16,6 +16,7 @@ import soundfile
 from hypothesis import strategies as st
 from synthetic import RATE, make_bands, make_recorder, make_signals, times
 
+import hapticrender as hr
 from hapticrender.recordings import formats, journal
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
@@ -185,6 +186,19 @@ def test_a_journal_that_is_being_written_is_not_replaced(recording, bands, signa
     assert len(recorder.finish()) == 5000
     read.save(path)
     assert len(Recording.load(path)) == 2500
+
+
+def test_a_journal_that_is_the_texture_is_not_replaced(tmp_path):
+    path = tmp_path / "run.au"
+    hr.render(hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=1e-5), duration=0.2), journal=path)
+    before, scene = path.read_bytes(), hr.Scene(texture=hr.Recorded(file=path, amplitude=1e-5), duration=0.2)
+    with pytest.raises(ValueError, match=r"run\.au: would overwrite the scene's texture: choose another name"):
+        hr.render(scene, journal=path)
+    with hr.Player(paced=False) as player:
+        player.play(scene.texture)
+        with pytest.raises(ValueError, match="would overwrite the scene's texture"):
+            player.record(path)
+    assert path.read_bytes() == before
 
 
 def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals, tmp_path):
