@@ -288,7 +288,7 @@ class AudioDriver(BaseDriver):
         return 0 if self._state == "new" else self._relay.count("clipped")
 
     @property
-    def load(self) -> float:
+    def cpu_load(self) -> float:
         """Time in the callback over the time of a block, averaged by PortAudio."""
         return 0.0 if self._stream is None else self._stream.load
 

@@ -11,8 +11,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``delay``
     samples from the moment that a sample is sensed to the moment that the drive computed from it acts, >= `block`
 ``play(drive)``
-    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples; a device
-    waits here until the block is due
+    plays a block, float64 of shape (block, drive_channels), in A, and returns `Sensed` of as many samples, in arrays
+    that it may use again; a device waits here until the block is due
 ``__enter__``, ``__exit__``
     makes the device ready, and leaves it at rest with zero drive whatever has happened
 ``zero_on_exit`` (optional)
@@ -33,6 +33,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``start(entry)``, ``stop()`` (optional)
     of a device that calls back: hands it a ``hapticrender.realtime_entry.RealtimeEntry``, with ``sensed_scale`` (m) and
     ``drive_scale`` (1/A) of full scale; its ``check()`` (optional) raises what went wrong meanwhile
+``cpu_load`` (optional)
+    float: share of its time that a callback takes, 1 is all; NaN where it is not known; shown by ``Player.state()``
 ``loop(rendering)`` (optional)
     of a device with a controller of its own: what it plays live, like ``hapticrender.live_loop.LiveLoop``
 ``exchange(controller)`` (optional)

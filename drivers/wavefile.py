@@ -5,6 +5,7 @@ A file is a device without sensors: the controller drives it open loop.  A sampl
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from hapticrender.protocols import Array, Flag, Sensed
 
 FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
+MARK = "hapticrender drive"  # begins the comment of a file, by which a later run knows it
 WIDTH = 32  # soundfile takes integers of any width left-justified in 32 bits
 
 
@@ -30,7 +32,8 @@ class WaveFileDriver(BaseDriver):
     Parameters
     ----------
     path : str or Path
-        File to write, anew; its ending chooses the format: .wav, .flac, .w64, .rf64, .aiff, .aif.
+        File to write, anew; its ending chooses the format: .wav, .flac, .w64, .rf64, .aiff, .aif.  One that is there is
+        refused unless it has this driver's comment, for which W64 has no room, or `overwrite` is True.
         W64 and RF64 hold more than 4 GB.
     rate : float, Hz, > 0
         The file's header holds the nearest whole number of Hz.
@@ -40,6 +43,8 @@ class WaveFileDriver(BaseDriver):
         FLOAT unless given, for FLAC PCM_24 (which holds integers of 16 and 24 bits only).
     drive_channels, block : int, >= 1
         Columns of drive, and samples a call.
+    overwrite : bool
+        Whether any file of that name may be replaced.
     """
 
     def __init__(
@@ -51,11 +56,16 @@ class WaveFileDriver(BaseDriver):
         subtype: str | None = None,
         drive_channels: int = 2,
         block: int = 1024,
+        overwrite: bool = False,
     ) -> None:
         self.path = Path(path)
         self.full_scale = number("full_scale", full_scale, "A", above=0.0)
         self.clipped = 0  # samples that the file holds cut to its range
         self._format, self._subtype = _file_form(self.path, subtype)
+        if not overwrite and not _is_own(self.path):
+            raise ValueError(
+                f"{path}: is there and no file of this driver: choose another name, or overwrite (--force)"
+            )
         super().__init__(rate=rate, drive_channels=drive_channels, sensed_channels=0, block=block)
 
     def _open(self) -> None:
@@ -65,6 +75,8 @@ class WaveFileDriver(BaseDriver):
             self._file = soundfile.SoundFile(
                 self.path, "w", round(self.rate), self.drive_channels, self._subtype, format=self._format
             )
+            if self._format != "W64":
+                self._file.comment = f"{MARK}, full scale = {self.full_scale:g} A"
         except (OSError, soundfile.SoundFileError) as error:
             form = f"{self._format} {self._subtype}, {self.drive_channels} channels, {self.rate:g} Hz"
             raise DriverError(f"{self.path}: open: {_reason(error)} ({form})") from error
@@ -88,6 +100,15 @@ class WaveFileDriver(BaseDriver):
 
     def __str__(self) -> str:
         return str(self.path)
+
+
+def _is_own(path: Path) -> bool:
+    """Whether this driver wrote the file, or nothing is in it or there."""
+    if not path.is_file() or not path.stat().st_size:
+        return True
+    with suppress(OSError, soundfile.SoundFileError), soundfile.SoundFile(path) as file:
+        return str(file.comment).startswith(MARK)
+    return False
 
 
 def _file_form(path: Path, subtype: str | None) -> tuple[str, str]:

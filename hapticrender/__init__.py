@@ -123,6 +123,8 @@ if _typing.TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> _typing.Any:
+    if name == "sweep":  # the module, whether or not anything has imported it
+        return _import_module(f"{__name__}.sweep")
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(_import_module(f"{__name__}.{_HOME_OF[name]}"), name)

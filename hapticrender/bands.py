@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -89,6 +89,11 @@ class Bands:
                 object.__setattr__(self, name, column)
                 _check(name, column, self.frequency.shape, unit, least)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether it is of the same type, with the same numbers."""
+        names = [entry.name for entry in fields(self)]
+        return type(self) is type(other) and all(np.array_equal(getattr(self, n), getattr(other, n)) for n in names)
+
     def __len__(self) -> int:
         return len(self.frequency)
 
@@ -117,7 +122,7 @@ class Bands:
         ValueError
             The first sample that is wrong, with its time and position.
         """
-        values = waveform(time, position)
+        values = waveform(np.array(time), np.array(position))  # which it may work in
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
             found = (
                 f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__

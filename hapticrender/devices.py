@@ -41,7 +41,7 @@ def registered(group: str, name: str) -> Any:
         raise HapticError(reason) from error
 
 
-def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | None:
+def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool = False) -> Driver | None:
     """Make the driver that a text names, for a ``with`` statement to open; None for the simulated device.
 
     Parameters
@@ -54,6 +54,8 @@ def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | Non
         Of the device: a driver gets those entries of its calibration, by keyword, that its parameters name
         (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter
         ``profile`` the profile itself.
+    overwrite : bool
+        Handed, where true, to a driver that has a parameter of that name.
 
     Raises
     ------
@@ -81,7 +83,8 @@ def open_driver(text: str, profile: DeviceProfile | None = None) -> Driver | Non
         factory = _imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
-            return factory(*[argument] * bool(colon), **_calibration(factory, profile))  # type: ignore[no-any-return]
+            options = {"overwrite": True} if overwrite and "overwrite" in inspect.signature(factory).parameters else {}
+            return factory(*[argument] * bool(colon), **_calibration(factory, profile), **options)  # type: ignore[no-any-return]
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
 

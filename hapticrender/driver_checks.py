@@ -49,7 +49,7 @@ def check_driver(driver: Any) -> None:
 
 
 def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
-    """Return a block that `driver` returned with its columns as contiguous float64 (flags int64).
+    """Return a block that `driver` returned with copies of its columns, contiguous float64 (flags int64).
 
     A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns.
     """
@@ -71,14 +71,14 @@ def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
 
 
 def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array:
-    """Contiguous float64 column, of flags int64; what would be cut off in that is refused."""
+    """Contiguous float64 copy of a column, of flags int64; what would be cut off in that is refused."""
     where, kind = f"{type(driver).__name__}: play: {name}", np.int64 if name == "flags" else float
     try:
         given = np.asarray(value)
         if given.dtype.kind == "c":
             raise TypeError("it is complex")
         with np.errstate(invalid="ignore"):
-            column = np.ascontiguousarray(given, kind)
+            column = np.array(given, kind, order="C")  # a copy: the driver may use its own again
         if name == "flags" and given.dtype.kind in "fO" and not (column == given).all():
             raise TypeError("it has fractions, NaN or infinity")
     except (TypeError, ValueError) as error:

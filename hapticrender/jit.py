@@ -18,7 +18,7 @@ import threading
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numba
 import numpy as np
@@ -219,6 +219,13 @@ def record_of(dtype: np.dtype[Any], *sources: object, **values: Any) -> np.ndarr
             raise ValueError(f"{name} of shape {value.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
         record[name] = value.ctypes.data if by_address else value
     return record
+
+
+class Addressed:
+    """Base of what holds addresses of arrays of its own, which a copy would read and write, too."""
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise TypeError(f"{type(self).__name__}: cannot be copied or pickled, it holds addresses: make a new one")
 
 
 def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:

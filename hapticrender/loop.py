@@ -30,6 +30,7 @@ from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
+from hapticrender.touch.composed import refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
@@ -62,6 +63,7 @@ def prepare(
         driver = open_driver(driver, scene.device_profile)
     if driver is not None and getattr(driver, "finger", driver) is None:
         driver.finger = scene.finger  # type: ignore[attr-defined]
+    refuse_to_overwrite(scene.texture, getattr(driver, "path", None))
     kind = getattr(driver, "device_kind", scene.device)
     if kind != scene.device:
         raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it, and plays nothing else")
@@ -162,6 +164,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
 def recorder_of(rendering: Rendering, journal: str | Path | None = None, **changes: Any) -> Recorder:
     """Return the writer of a recording of `rendering`; `changes` are arguments of `Recorder` in place of its own."""
     driver, model, scene = rendering.driver, rendering.model, rendering.scene
+    refuse_to_overwrite(scene.texture, journal)
     calibration = getattr(rendering.device, "calibration", 0.0) or scene.device_profile.calibration.gain_uncertainty
     arguments = {
         "scene": scene,

@@ -273,7 +273,7 @@ class Player:
         with self._lock, self._busy():
             loop = self._playing("state")
             self._service()
-            load = float(getattr(loop.rendering.device, "load", math.nan))
+            load = float(getattr(loop.rendering.device, "cpu_load", math.nan))
             bands = tuple(BandState(*row) for row in loop.figures())
             return PlayerState(self.time, loop.model.unit, bands, loop.flags, self._lost, load)
 

@@ -51,6 +51,13 @@ class Sensed(NamedTuple):
     normal_load: Array | None = None  # (n,), N
     flags: Array | None = None  # (n,), `Flag` bits raised by the device
 
+    def __eq__(self, other: object) -> bool:
+        """Whether it is the same block; a tuple's own comparison fails on arrays."""
+        return self is other
+
+    def __ne__(self, other: object) -> bool:
+        return self is not other
+
 
 @runtime_checkable
 class Texture(Protocol):
@@ -154,7 +161,7 @@ class Controller(Protocol):
         ...
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Rendering:
     """A scene opened on a device: all that a run needs, designed and checked; nothing has been played yet."""
 

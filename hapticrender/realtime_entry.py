@@ -27,7 +27,7 @@ from hapticrender.checks import number
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
-from hapticrender.jit import CFunction, addresses, record_of
+from hapticrender.jit import Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
 from hapticrender.sampled_texture import FADE, SampledTexture
@@ -62,7 +62,7 @@ class _Control:
         self.address = int(self.record.ctypes.data)
 
 
-class RealtimeEntry:
+class RealtimeEntry(Addressed):
     """A controller of any device and method behind a C function with one user-data pointer.
 
     Parameters

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, kernel, pointer, record, record_of
+from hapticrender.jit import F8, Addressed, kernel, pointer, record, record_of
 from hapticrender.protocols import Texture
 from hapticrender.touch.composed import SeparatedTexture
 
@@ -64,7 +64,7 @@ def along_surface(texture, position):
     return inner - high * ((2.0 - x) * profile[i - 1] + (1.0 + x) * profile[i + 2])
 
 
-class SampledTexture:
+class SampledTexture(Addressed):
     """A texture in memory at `rate` (Hz); a ValueError where `SeparatedTexture` refuses it, or it is not finite."""
 
     def __init__(self, texture: Texture, rate: float, waveform_of: Any = None) -> None:

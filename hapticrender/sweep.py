@@ -59,6 +59,7 @@ def sweep(
     [True, True]
     """
     at_a_time = checks.integer("at_a_time", at_a_time, "scenes", least=1)
+    checks.require(isinstance(scenes, Iterable), "scenes", scenes, "scenes, in a list for example", TypeError)
     numbered = list(enumerate(scenes))
     parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
     if executor is None:

@@ -88,7 +88,7 @@ def render(arguments: argparse.Namespace) -> int:
 
             found = least_model(scene)
             scene, notes = found.scene, found.text
-        driver = _driver(arguments.driver, scene)
+        driver = _driver(arguments.driver, scene, arguments.force)
     [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
     with progress(f"1/1 {arguments.scene}", sys.stderr) as tick, naming_driver(arguments.driver):
         outputs = run_into(arguments.out, rendering, progress=tick)
@@ -124,7 +124,7 @@ def play(arguments: argparse.Namespace) -> int:
         with (
             naming_driver(arguments.driver),
             naming(arguments.scene),
-            Player(scene, _driver(arguments.driver, scene)) as player,
+            Player(scene, _driver(arguments.driver, scene, arguments.force)) as player,
         ):
             player.play(scene.texture)
             if out:
@@ -310,6 +310,8 @@ def latency(arguments: argparse.Namespace) -> int:
     driver = open_driver(arguments.driver)
     if driver is None:
         raise ValueError("--driver = 'simulated': must be a device with a cable, such as audio:0")
+    if hasattr(driver, "driven_by_host"):
+        raise ValueError(f"--driver = {arguments.driver!r}: the loop runs on the board, whose design states its delay")
     with naming_driver(arguments.driver):
         found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
     print(printable(f"{arguments.driver}: {found}"))
@@ -387,11 +389,11 @@ def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: An
     return renderings
 
 
-def _driver(text: str, scene: Scene) -> Any:
+def _driver(text: str, scene: Scene, overwrite: bool = False) -> Any:
     """Make the driver of ``--driver``, calibrated as the scene states; None for the simulated device.
 
     A module of the user's is looked for in the folder that the command is run in, too.
     """
     if "" not in sys.path:
         sys.path.insert(0, "")
-    return open_driver(text, scene.device_profile)
+    return open_driver(text, scene.device_profile, overwrite)

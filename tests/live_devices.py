@@ -62,7 +62,7 @@ class Calling(Bench):
     rate, block, delay = 48_000.0, 64, 64
     drive_channels = sensed_channels = 2
     sensed_scale, drive_scale, probe, zero_on_exit = 1e-3, 0.5, False, True
-    load = 0.25
+    cpu_load = 0.25
 
     def __init__(self):
         parameters = replace(PlateParameters(), rate=self.rate, delay=self.delay)

@@ -34,6 +34,13 @@ kind = "vt-plate"
 SCENE_FILES = {"scene.toml", "recording.au", "drive.wav", "sensed.wav", "summary.json"}
 
 
+class Hosted:
+    """A board, as far as the verb `latency` looks."""
+
+    def driven_by_host(self):
+        raise NotImplementedError
+
+
 @pytest.fixture
 def run(capsys):
     """Run the command line: status, output, and the lines of its errors without that it compiles, on a slow machine."""
@@ -147,6 +154,29 @@ RAISED = [
     (lambda *_: {}["usb"], "hapticrender: other_plate:OtherPlate: KeyError: 'usb'"),
     (lambda *_: sys.exit(0), "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"),
 ]
+
+
+@pytest.mark.parametrize("ending", [".wav", ".w64"])
+def test_a_drive_replaces_its_own_file_and_by_force_any_but_the_texture(run, tmp_path, ending):
+    """A W64 file has no room to say whose it is."""
+    played, scene = tmp_path / f"mine{ending}", tmp_path / "scene.toml"
+    soundfile.write(played, np.sin(np.arange(4000) / 10.0), 5000, subtype="DOUBLE")
+    tone = 'kind = "grating", frequency = 47.0, amplitude = 1e-5'
+    file = f'kind = "sum", parts = [[{{kind = "recorded", file = "{played.name}", amplitude = 1e-5}}, 1.0]]'
+    again = "" if ending == ".wav" else "no file of this driver"
+    for texture, force, words in (
+        (file, ["--force"], "would overwrite the scene's texture"),
+        (tone, [], "no file of this driver"),
+        (tone, ["--force"], ""),
+        (tone, [], again),
+    ):
+        before = played.read_bytes()
+        duration = 0.3 if force else 0.4
+        scene.write_text(f"duration = {duration}\ntexture = {{{texture}}}\n[render]\nsettle = 0.1\n")
+        status, _, error = run("render", scene, "--out", tmp_path / "out", "--driver", f"wavefile:{played}", *force)
+        assert status == (2 if words else 0), error
+        assert words in "".join(error)
+        assert (played.read_bytes() == before) == bool(words)
 
 
 @pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
@@ -278,6 +308,7 @@ BAD_ARGUMENTS = [
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
     (["latency", "--driver", "simulated"], "must be a device with a cable, such as audio:0"),
     (["latency", "--driver", "wavefile:{out}.wav"], "senses nothing: a round trip needs an input"),
+    (["latency", "--driver", "test_cli:Hosted"], "the loop runs on the board, whose design states its delay"),
     (["latency", "--driver", "audio:no such card"], "audio:"),
     (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),

@@ -6,9 +6,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+from waves import Own
 
 import hapticrender as hr
 from hapticrender.control.methods import METHODS
+from hapticrender.touch import composed
 from hapticrender.touch.grating import Grating
 
 TIME = np.arange(0.0, 3.0, 1 / 5000)
@@ -90,6 +92,91 @@ def test_a_playlist_joins_its_parts_without_a_click_where_friction_is_the_slope(
 def test_a_scene_file_holds_them(texture):
     scene = hr.Scene(texture=texture, duration=1.0)
     assert hr.Scene.from_toml_text(scene.to_toml()) == scene
+
+
+class InPlace:
+    """A texture and a motion of one's own: of the arrays that they are handed, or of copies of them."""
+
+    def __init__(self, spatial, copies):
+        self.spatial, self.take = spatial, np.copy if copies else np.asarray
+        self.bands = Own(None, spatial).bands
+
+    def waveform(self, time, position):
+        turns = self.take(position if self.spatial else time)
+        turns *= 1000.0 if self.spatial else 100.0
+        return 5e-6 * np.sin(2 * np.pi * turns)
+
+    def position(self, time):
+        place = self.take(time)
+        place *= 0.08
+        return place
+
+    load = position
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_what_is_handed_to_a_users_code_is_a_copy(spatial):
+    """A texture that works in place changed that of the next part, what was recorded and constants of the module."""
+    readings, found = composed.READINGS.copy(), []
+    for copies in (False, True):
+        own = InPlace(spatial, copies)
+        texture = hr.Sum([(own, 1.0), (RIDGES if spatial else TONE, 0.5)])
+        time = TIME.copy()
+        waveform = texture.waveform(time, time)
+        assert np.array_equal(time, TIME)
+        run = hr.render(hr.Scene(texture=texture, finger=hr.Finger(own, None), duration=0.5))
+        with hr.Player(paced=False) as player:
+            player.play(texture)
+            player.play(own)
+            player.sleep(0.1)
+        found.append([waveform, run.position, run.normal_load, run.reference, run.drive])
+    assert np.array_equal(composed.READINGS, readings)
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_textures_are_added_and_subtracted():
+    class Mine(Own):
+        """One of one's own, without operators."""
+
+    mine = Mine(lambda time, position: 1e-6 * np.sin(time))
+    a, b = TONE.waveform(TIME, AWAY), CHIRP.waveform(TIME, AWAY)
+    for texture, expected in (
+        (sum([TONE, CHIRP]), a + b),
+        (TONE - CHIRP, a - b),
+        (TONE - (CHIRP - 0.5 * TONE), 1.5 * a - b),
+        (-TONE, -a),
+        (TONE - mine, a - 1e-6 * np.sin(TIME)),
+    ):
+        np.testing.assert_allclose(texture.waveform(TIME, AWAY), expected, atol=1e-18)
+    for act in (lambda: TONE - 1, lambda: 1 + TONE, lambda: 1 - TONE, lambda: sum([TONE], 1.0)):
+        with pytest.raises(TypeError, match="unsupported operand"):
+            act()
+
+
+def test_bands_are_equal_by_their_numbers():
+    one, other = (TONE + RIDGES).bands(5000.0), (TONE + RIDGES).bands(5000.0)
+    assert one == other
+    assert one in [other]
+    louder = (TONE + 2 * RIDGES).bands(5000.0)
+    for different in (louder, TONE.bands(5000.0), hr.Bands.none(spatial=True), 2 * one.envelope, None):
+        assert one != different
+    assert hr.Bands.none(spatial=True) != hr.Bands.none(spatial=False)
+    scene = hr.Scene(texture=TONE, duration=0.1)
+    runs = [
+        hr.Recorder(None, scene=scene, method="h2", seed=0, rate=5000.0, bands=each) for each in (one, other, louder)
+    ]
+    assert runs[0].header == runs[1].header != runs[2].header
+
+
+def test_what_holds_signals_is_equal_to_itself_alone():
+    blocks, scene = [hr.Sensed(np.zeros((2, 2)), np.zeros(2)) for _ in range(2)], hr.builtin_scenes()["grating-47"]
+    models = [hr.prepare(scene, compiled=False).model for _ in range(2)]
+    for one, other in (blocks, models):
+        assert one == one  # noqa: PLR0124
+        assert one != other
+        assert one in [other, one]
+        assert one not in [other]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The demodulator against scipy's filters and its printed digits; the error observer's innovation against its law."""
 
+import copy
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -32,6 +34,18 @@ def test_any_split_into_blocks_gives_the_same(rng):
     split = hr.Demodulator(frequency, BANDWIDTH, RATE, 2)
     parts = [split.run(part) for part in np.split(samples, [1, 63, 64, 65, 200])]
     assert np.array_equal(np.concatenate(parts), hr.Demodulator(frequency, BANDWIDTH, RATE, 2).run(samples))
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda it: pickle.loads(pickle.dumps(it))])
+def test_copies_go_on_each_for_itself(duplicate, rng):
+    """Their memory is aligned, without which the compiled code ends the interpreter."""
+    samples, one = rng.standard_normal((300, 2)), hr.Demodulator([20.0, 72.0], BANDWIDTH, RATE, 2)
+    before, copies = one.run(samples[:200]), [duplicate(one) for _ in range(8)]
+    assert before.any()
+    assert all(each._tiles.ctypes.data % 64 == 0 for each in copies)
+    after = one.run(samples[200:])
+    del one
+    assert all(np.array_equal(each.run(samples[200:]), after) for each in copies)
 
 
 def test_after_an_hour_the_phase_is_the_tone_s():

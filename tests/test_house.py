@@ -6,6 +6,8 @@ import graphlib
 import importlib
 import inspect
 import re
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -65,6 +67,11 @@ def test_the_package_shows_its_public_names_and_nothing_else():
     public = {name for name in dir(hapticrender) if not name.startswith("_")}
     assert set(hapticrender.__all__) <= public <= set(hapticrender.__all__) | rooms
     assert not [name for name in ("Any", "TYPE_CHECKING", "annotations") if hasattr(hapticrender, name)]
+
+
+def test_sweep_is_a_module_before_and_after_its_import():
+    script = "import hapticrender as hr; before = hr.sweep; import hapticrender.sweep; assert before is hr.sweep"
+    subprocess.run([sys.executable, "-c", script + "; assert before.sweep"], check=True, cwd=ROOT)
 
 
 def test_type_checkers_see_every_public_name():
@@ -227,6 +234,11 @@ def test_python_on_the_page_about_the_finger_runs(run_python):
     analyse = names["hr"].analyse_finger
     assert analyse(names["theirs"]).of_kind(2) == names["found"].of_kind(2)
     assert len(names["touch"].time) == 50
+
+
+def test_python_on_the_page_about_devices_runs(run_python):
+    """The last position is estimated no farther off than the finger has moved."""
+    assert abs(run_python("docs/devices.md")["found"].position - 0.0108) < 0.0108 - 0.0100
 
 
 def test_commands_in_the_readme_are_in_the_makefile():

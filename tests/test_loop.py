@@ -88,6 +88,35 @@ def test_a_driver_may_convert_the_drive_in_place_and_stop_the_device():
             player.sleep(0.5)
 
 
+class Reusing(Blocks):
+    """Fills the same arrays again and again, where it `reuses` them; of a device that states no motion."""
+
+    probe = True
+
+    def __init__(self, plant, reuses):
+        super().__init__(plant)
+        self.kept = [] if reuses else None
+
+    def play(self, drive):
+        sensed = super().play(drive)._replace(motion=None)
+        if self.kept is None:
+            return sensed
+        self.kept = self.kept or [each if each is None else each.copy() for each in sensed]
+        for own, new in zip(self.kept, sensed, strict=True):
+            if own is not None:
+                own[:] = new
+        return hr.Sensed(*self.kept)
+
+
+@pytest.mark.parametrize("name", ["grating-47", "one-texture-electroadhesion"])
+def test_a_driver_may_use_its_arrays_again(name):
+    """The probe of a plate keeps blocks until its end, and a screen's tribometer shows friction later."""
+    scene = dataclasses.replace(hr.builtin_scenes()[name], duration=0.3, settle=0.1)
+    found = [hr.render(scene, driver=Reusing(hr.prepare(scene).plant, reuses)) for reuses in (False, True)]
+    equal(*found, [column for column in COLUMNS if column != "motion"])
+    np.testing.assert_array_equal(found[0].motion, found[1].motion)
+
+
 def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
     """With a delay of 6 samples, blocks of 1, 2, 3 and 6 leave 5, 4, 3 and 0 of them inside the device."""
     expected = hr.render(SPATIAL, driver=simulated(SPATIAL, delay=6))

@@ -250,6 +250,14 @@ def test_a_device_that_calls_back_is_handed_the_compiled_entry(method):
     assert abs(device.last).max() == 0.0
 
 
+def test_a_load_of_the_devices_own_is_not_the_players():
+    device = Blind(Plate(PlateParameters(), hr.Finger.absent()))
+    device.load = lambda time: 0.4
+    with hr.Player(driver=device, paced=False) as player:
+        player.play(TONE)
+        assert np.isnan(player.state().load)
+
+
 def test_what_it_refuses(tmp_path):
     with hr.Player(paced=False) as player:
         for act, what in (

@@ -1,5 +1,6 @@
 """The compiled entry: called from a thread of C while Python keeps its lock, it does what the Python path does."""
 
+import copy
 import ctypes
 import sys
 import time
@@ -13,6 +14,7 @@ from synthetic import make_bands
 from test_kernel import friction_controller, plate_controller
 from waves import Own
 
+import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.jit import F8, kernel, pointer
@@ -322,3 +324,14 @@ def test_slots_change_hands_whole():
         found = pool.submit(read, *arguments, rounds)
         pool.submit(write, *arguments, rounds)
         assert found.result(60) == (0, 0)
+
+
+def test_what_holds_addresses_is_not_copied():
+    """A copy would read and write the memory of the first."""
+    bank, scenes = controller(), hr.builtin_scenes()
+    texture = SampledTexture(hr.Grating(frequency=72.0, amplitude=1e-5), 5000.0)
+    own = [hr.prepare(scenes[name], compiled=False).controller() for name in ("grating-72", "one-texture-hybrid")]
+    for each in (bank, RealtimeEntry(bank), texture, *own):
+        for duplicate in (copy.copy, copy.deepcopy):
+            with pytest.raises(TypeError, match=rf"^{type(each).__name__}: cannot be copied or pickled"):
+                duplicate(each)

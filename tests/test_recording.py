@@ -16,6 +16,7 @@ import soundfile
 from hypothesis import strategies as st
 from synthetic import RATE, make_bands, make_recorder, make_signals, times
 
+import hapticrender as hr
 from hapticrender.recordings import formats, journal
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
@@ -134,16 +135,70 @@ def test_a_killed_process_leaves_all_but_its_last_quarter_second(tmp_path):
 
 def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
     path = tmp_path / "run.au"
-    path.write_bytes(b"older")
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**{name: values[:5] for name, values in signals.items()})
+    older = path.read_bytes()
     with pytest.raises(RuntimeError, match="bad input"), make_recorder(path, bands):
         raise RuntimeError("bad input")
-    assert path.read_bytes() == b"older"
+    assert path.read_bytes() == older
     with make_recorder(path, bands) as recorder:
         with pytest.raises(ValueError, match=r"drive has shape \(2500, 1\), expected 2500 samples, 2 columns"):
             recorder.append(**signals | {"drive": signals["drive"][:, :1]})
-        assert path.read_bytes() == b"older"
+        assert path.read_bytes() == older
         recorder.append(**signals)
     assert len(Recording.load(path)) == 2500
+
+
+@pytest.mark.parametrize(("held", "refused"), [(b"notes of mine", True), (b".snd" + bytes(99), True), (b"", False)])
+def test_what_is_no_journal_is_not_replaced(bands, tmp_path, held, refused):
+    path = tmp_path / "mine.au"
+    path.write_bytes(held)
+    if refused:
+        with pytest.raises(
+            ValueError, match=r"mine\.au: is there and no recording of this library: choose another name"
+        ):
+            make_recorder(path, bands)
+        assert path.read_bytes() == held
+    else:
+        with make_recorder(path, bands) as recorder:
+            recorder.begin()
+
+
+def test_a_damaged_or_older_journal_is_replaced(recording, bands, signals, tmp_path):
+    path = tmp_path / "run.au"
+    recording.save(path)
+    path.write_bytes(path.read_bytes()[:200].replace(b'"version": 2', b'"version": 1'))
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**signals)
+    assert_same(recorder.finish(), recording)
+
+
+def test_a_journal_that_is_being_written_is_not_replaced(recording, bands, signals, tmp_path):
+    path = tmp_path / "live.au"
+    with make_recorder(path, bands) as recorder:
+        recorder.append(**signals)
+        read, words = Recording.load(path), "is being recorded: end that first"
+        for act in (lambda: read.save(path), lambda: recording.save(path), make_recorder(path, bands).begin):
+            with pytest.raises(ValueError, match=words):
+                act()
+        read.save(tmp_path / "other.au")
+        recorder.append(**signals)
+    assert len(recorder.finish()) == 5000
+    read.save(path)
+    assert len(Recording.load(path)) == 2500
+
+
+def test_a_journal_that_is_the_texture_is_not_replaced(tmp_path):
+    path = tmp_path / "run.au"
+    hr.render(hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=1e-5), duration=0.2), journal=path)
+    before, scene = path.read_bytes(), hr.Scene(texture=hr.Recorded(file=path, amplitude=1e-5), duration=0.2)
+    with pytest.raises(ValueError, match=r"run\.au: would overwrite the scene's texture: choose another name"):
+        hr.render(scene, journal=path)
+    with hr.Player(paced=False) as player:
+        player.play(scene.texture)
+        with pytest.raises(ValueError, match="would overwrite the scene's texture"):
+            player.record(path)
+    assert path.read_bytes() == before
 
 
 def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals, tmp_path):
@@ -210,6 +265,23 @@ def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     with pytest.raises(ValueError, match=rf"run\{suffix}: not a recording \(\S") as refused:
         Recording.load(path)
     assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"name": "drive", "step": 0}, ValueError, "step = 0: must be an integer >= 1 samples"),
+        ({"name": "drive", "step": -2}, ValueError, "step = -2: must be an integer >= 1 samples"),
+        ({"name": "drive", "step": 1.5}, TypeError, "step = 1.5: must be an integer"),
+        ({"name": "foo"}, ValueError, "name = 'foo': must be one of drive, sensed, motion, position, normal_load, "),
+    ],
+)
+def test_what_cannot_be_read_is_named(recording, tmp_path, arguments, error, message):
+    recording.save(tmp_path / "run.au")
+    for each in (recording, Recording.load(tmp_path / "run.au")):
+        with pytest.raises(error, match=message):
+            each.read(**arguments)
+        assert len(each.read("drive", 0, 10, 3)) == 4
 
 
 @pytest.mark.parametrize("suffix", [".wav", ".flac"])

@@ -303,6 +303,7 @@ SCENES = [
         for device in ("electroadhesion", "ultrasonic")
     ),
     (lambda: sweep([TONE], at_a_time=0), "at_a_time = 0: must be an integer >= 1 scenes"),
+    (lambda: sweep(hr.Scene(texture=TONE, duration=1.0)), "scenes = Scene.*: must be scenes, in a list"),
     (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
     (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
     (lambda: rendered(Own(lambda time, x: time[:-1])), r"Own.waveform returned float64 of shape \(\d+,\): must be"),

@@ -1,6 +1,7 @@
 """Boards: the compiled firmware as a process behind a pseudo-terminal, played through the drivers."""
 
 import os
+import subprocess
 from dataclasses import replace
 
 import board
@@ -17,6 +18,11 @@ from hapticrender.errors import DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.plants.plate import PlateParameters
 
 ROUNDING = 2.0**-24  # relative, of float32
+
+
+def test_the_board_as_a_process_prints_its_usage():
+    found = subprocess.run([program_of("-O2")], capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stderr.partition(" [")[0]) == (2, "usage: board LINK")
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
  * the finger is where the host sends it.
  *
- *   board_posix LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]
+ *   board LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]
  *
  * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
  * --step by its standard input: a line
@@ -48,7 +48,7 @@ static volatile sig_atomic_t ended;
 
 static void fail(const char *what)
 {
-    fprintf(stderr, "board_posix: %s: %s\n", what, strerror(errno));
+    fprintf(stderr, "board: %s: %s\n", what, strerror(errno));
     exit(1);
 }
 
@@ -231,7 +231,7 @@ static void take_option(const char *name, const char *value)
     if (strcmp(name, "--log") == 0 && (log_file = fopen(value, "w")) != NULL) {
         return;
     }
-    fprintf(stderr, "board_posix: option %s %s: see the head of hardware_posix.c\n", name, value);
+    fprintf(stderr, "board: option %s %s: see the head of hardware_posix.c\n", name, value);
     exit(2);
 }
 
@@ -245,7 +245,7 @@ int main(int argc, char **argv)
 {
     struct sigaction action;
     if (argc < 2) {
-        fprintf(stderr, "board_posix: LINK is missing: see the head of hardware_posix.c\n");
+        fprintf(stderr, "usage: board LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]\n");
         return 2;
     }
     link_path = argv[1];

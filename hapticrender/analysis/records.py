@@ -13,7 +13,7 @@ UNLOADED, DOUBTFUL, LOADED = 0, 1, 2  # contact of a sample
 KINDS = {UNLOADED: "unloaded", DOUBTFUL: "doubtful", LOADED: "loaded"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Series:
     """A quantity over time."""
 
@@ -31,7 +31,7 @@ class Segment:
     stop: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Impedance:
     """Mechanical impedance of the finger over time and frequency, ``Z_f = F_f / v`` at the finger.
 
@@ -53,7 +53,7 @@ class Impedance:
         return np.asarray(self.value * self.velocity)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PlateTrack:
     """The plate's "stiffness_1", "stiffness_2" (N/m), "damping_1" and "damping_2" (N s/m) over time."""
 
@@ -63,7 +63,7 @@ class PlateTrack:
     measured: bool  # they come from unloaded spans of the recording; otherwise they are the profile's
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Touch:
     """Estimates of a finger over time."""
 
@@ -87,7 +87,7 @@ def _joined(parts: Sequence[Series]) -> Series:
     return Series(value, error, parts[0].bandwidth)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FingerRecord(Touch):
     """Measured quantities of the finger in a recording, whose `name` it has.
 

@@ -19,11 +19,11 @@ from hapticrender.control.controller import BankController, refuse_whole_wavefor
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, TILE_T, W
 from hapticrender.control.supervisor import Fault, SupervisedController, supervised
-from hapticrender.jit import C16, F8, I8, SIGNALS_T, addresses, call, pointer, record, record_of, step
+from hapticrender.jit import C16, F8, I8, SIGNALS_T, Addressed, addresses, call, pointer, record, record_of, step
 from hapticrender.protocols import Array, Method
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CombinedModel(DeviceModel):
     """Device model of a device of two parts, which have a model and a controller each."""
 
@@ -32,7 +32,7 @@ class CombinedModel(DeviceModel):
     velocity_per_force: float  # m/(N s): skin velocity that feels as strong as a newton of friction
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class CombinedBands(Bands):
     """Bands of a device of two parts, their envelopes the target displacement (m), and the share of each part."""
 
@@ -99,7 +99,7 @@ def combined_step(state, signals, start, count):
     return 0
 
 
-class CombinedController:
+class CombinedController(Addressed):
     """Two controllers behind the `Controller` protocol, of plate and friction device; `design_combined` makes one.
 
     A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part,

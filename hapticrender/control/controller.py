@@ -25,7 +25,7 @@ from hapticrender.control.records import (
     aligned,
     lanes,
 )
-from hapticrender.jit import CFunction, addresses, record_of
+from hapticrender.jit import Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array
 
 LARGEST_GROUP = 16  # samples of a block whose carriers are taken from the middle of them,
@@ -34,7 +34,7 @@ SETTLED = 0.05  # of a target: below it an error counts as settled
 LEAST_TARGET = 3e-3  # of the sensors' range: below it noise adds more than a wrong device model
 
 
-class BankController:
+class BankController(Addressed):
     """A bank of bands behind the `Controller` protocol: settings, state and a compiled step, designed by `method`.
 
     `settings` are fields of `records.SETTINGS`, zero where left out; `history` counts the steps of adaptation whose

@@ -160,6 +160,12 @@ class Demodulator:
         ):
             self._tiles[name] = np.tile(value, (self.channels, 1))
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take the state of the one that this is a copy of, in memory of its own that is aligned, too."""
+        self.__dict__.update(state)
+        self._tiles = aligned(state["_tiles"].shape, TILE)
+        self._tiles[:] = state["_tiles"]
+
     def run(self, samples: Array, out: Array | None = None) -> Array:
         """Estimate the envelopes of the next n samples; any split into blocks gives the same.
 

@@ -43,7 +43,7 @@ class Demand:
     highest: float  # Hz
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class DeviceModel:
     """All that the controller is given of a device of c coordinates, d drive channels, s sensors and p places.
 

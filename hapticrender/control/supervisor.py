@@ -31,7 +31,7 @@ from hapticrender.control.supervisor_kernel import (
     SWAPPED,
     supervised_step,
 )
-from hapticrender.jit import CFunction
+from hapticrender.jit import Addressed, CFunction
 from hapticrender.protocols import Array, Controller
 
 FADE_OUT, FADE_DANGER, FADE_NOW = 10e-3, 2e-3, 0.2e-3  # s
@@ -125,7 +125,7 @@ CAUSES = {
 }
 
 
-class SupervisedController:
+class SupervisedController(Addressed):
     """A controller with a compiled step, supervised, behind the `Controller` protocol.
 
     All that is not named here is the controller's own; `fault` says why the drive has been stopped, None while it

@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
-from hapticrender.recordings.journal import Header, chunks, join, read_journal, split, write_journal
+from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
 
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 
@@ -46,6 +46,7 @@ def write(path: str | os.PathLike[str], header: Header, frames: Any) -> None:
     """Write a recording in the format of the suffix of `path`; an older file is replaced when the new one is whole."""
     path = Path(path)
     writer = _by_suffix(path, WRITERS, "written")
+    refuse_open(path)
     with replacing(path) as scratch:
         writer(scratch, header, frames)
 

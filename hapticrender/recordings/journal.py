@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -33,6 +33,7 @@ AU_HEAD = struct.Struct(">4s5I")  # magic, data offset, data size, encoding, rat
 AU_MAGIC, AU_UNKNOWN_SIZE, AU_DOUBLE = b".snd", 0xFFFFFFFF, 7
 JOURNAL_DTYPE = np.dtype(">f8")
 CHUNK_VALUES = 2**20  # numbers read at once
+OPEN: weakref.WeakValueDictionary[str, BinaryIO] = weakref.WeakValueDictionary()  # journals written here, by real path
 LONGEST_NOTE = 2**26  # bytes of header
 MOTION_SOURCES = ("true", "sensors", "inferred", "unknown")
 _COLUMNS, _MARKS = ("frequency", "wavenumber", "phase"), ("modulated", "differentiated", "spatial")  # of bands
@@ -186,6 +187,22 @@ def journal_head(header: Header) -> bytes:
     offset = AU_HEAD.size + len(note)
     rate, columns = max(1, round(header.rate)), len(header.channels)
     return AU_HEAD.pack(AU_MAGIC, offset, AU_UNKNOWN_SIZE, AU_DOUBLE, rate, columns) + note
+
+
+def refuse_open(path: Path) -> None:
+    """Refuse to replace a journal that is being written."""
+    file = OPEN.get(os.path.realpath(path))
+    if file is not None and not file.closed:
+        raise ValueError(f"{path}: is being recorded: end that first, or choose another name")
+
+
+def refuse_others(path: Path) -> None:
+    """Refuse to replace a file that is not empty and no journal, of whatever version and however damaged."""
+    if path.is_file() and path.stat().st_size:
+        with path.open("rb") as file:
+            start = file.read(100)
+        if not (start.startswith(AU_MAGIC) and FORMAT.encode() in start):
+            raise ValueError(f"{path}: is there and no recording of this library: choose another name")
 
 
 class JournalFrames:

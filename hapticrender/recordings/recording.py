@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
@@ -51,7 +52,7 @@ class Recorder:
     Raises
     ------
     ValueError, TypeError
-        The path does not end in .au, or a field is out of its bounds.
+        The path does not end in .au, a file of that name is no journal, or a field is out of its bounds.
     """
 
     def __init__(
@@ -65,6 +66,8 @@ class Recorder:
         self.path = None if path is None else Path(path)
         if self.path is not None and self.path.suffix.lower() != ".au":
             raise ValueError(f"{self.path}: a journal is a Sun AU file, its name must end in .au")
+        if self.path is not None:
+            journal.refuse_others(self.path)
         self.header = Header.of(scene, **header)
         self._scene, self._requested = scene, requested
         self._done, self._before = 0, np.full(2, np.nan)  # samples with a reference; the finger's last positions (m)
@@ -103,8 +106,10 @@ class Recorder:
     def begin(self) -> None:
         """Make the file of `path` now, not at the first block; an OSError states why it cannot be written."""
         path = Path(self.path or "")
+        journal.refuse_open(path)
         path.unlink(missing_ok=True)  # a recording may still read the old file: replace it, never write into it
         self._file = path.open("xb")
+        journal.OPEN[os.path.realpath(path)] = self._file
 
     def flush(self) -> None:
         """Hand everything appended so far to the operating system; without a path, do nothing."""
@@ -251,6 +256,8 @@ class Recording:
 
         `name` is "drive", "sensed", "motion", "position", "normal_load", "flags", "reference" or "target".
         """
+        require(name in self.header.slices, "name", name, f"one of {', '.join(self.header.slices)}")
+        step = integer("step", step, "samples", least=1)
         if isinstance(self.frames, np.ndarray):
             return journal.column(self.header, self.frames[start:stop:step], name)
         columns = len(self.header.channels)

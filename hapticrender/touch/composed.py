@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -26,7 +27,7 @@ Parts = tuple[tuple[Texture, float], ...]
 
 
 class Composable:
-    """Base of the library's textures: ``a + b`` and ``0.5 * a`` are `Sum`s."""
+    """Base of the library's textures: ``a + b``, ``a - b``, ``0.5 * a`` and ``sum([a, b])`` are `Sum`s."""
 
     def __add__(self, other: Any) -> Sum:
         return Sum((*_terms(self), *_terms(other))) if isinstance(other, Texture) else NotImplemented
@@ -35,6 +36,15 @@ class Composable:
         return Sum(tuple((each, gain * own) for each, own in _terms(self)))
 
     __rmul__ = __mul__
+
+    def __neg__(self) -> Sum:
+        return self * -1.0
+
+    def __sub__(self, other: Any) -> Sum:
+        return self + -Sum(_terms(other)) if isinstance(other, Texture) else NotImplemented
+
+    def __radd__(self, other: Any) -> Any:  # the 0 that `sum` begins with
+        return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
 def _terms(texture: Any) -> Parts:
@@ -45,6 +55,15 @@ def lies_along_surface(texture: Texture) -> bool:
     """Whether a texture is read at the finger's position: its `spatial` says so; without that, its bands do."""
     stated = getattr(texture, "spatial", None)
     return bool(texture.bands(NOMINAL_RATE).follows_finger if stated is None else stated)
+
+
+def refuse_to_overwrite(texture: Texture, path: Any) -> None:
+    """Refuse to write to `path` where a texture, or a part of it, is read from that file."""
+    for part, _ in texture.parts if isinstance(texture, _Composed) else ():
+        refuse_to_overwrite(part, path)
+    files: tuple[Any, Any] = getattr(texture, "file", None), path
+    if all(isinstance(each, str | os.PathLike) and os.path.exists(each) for each in files) and os.path.samefile(*files):
+        raise ValueError(f"{path}: would overwrite the scene's texture: choose another name")
 
 
 class SeparatedTexture:
@@ -170,7 +189,8 @@ class Sum(Validated, _Composed):
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)) at `time` (s) with the finger at `position` (m)."""
-        return np.sum([gain * texture.waveform(time, position) for texture, gain in self.parts], axis=0)
+        values = [gain * texture.waveform(np.array(time), np.array(position)) for texture, gain in self.parts]
+        return np.sum(values, axis=0)
 
 
 @dataclass(frozen=True)

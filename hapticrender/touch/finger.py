@@ -133,7 +133,7 @@ class Finger(Validated):
     def position(self, time: Array) -> Array:
         """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""
         time = np.asarray(time, float)
-        position = np.asarray(self.motion.position(time), float)
+        position = np.array(self.motion.position(time.copy()), float)
         if self.touches is None:
             return position
         inside = np.searchsorted(np.ravel(self.touches), time, side="right") % 2 == 1
@@ -152,7 +152,7 @@ class Finger(Validated):
         touch = np.empty((time.size, 3))
         touch[:, 0] = self.position(time)
         known = self.normal_load is not None
-        touch[:, 1] = np.interp(time, *self._load_curve) if known else self.motion.load(time)  # type: ignore[attr-defined]
+        touch[:, 1] = np.interp(time, *self._load_curve) if known else self.motion.load(time.copy())  # type: ignore[attr-defined]
         touch[:, 2] = self.mechanics.load_factor(touch[:, 1]) if self.load_scaling else 1.0
         touch[np.isnan(touch[:, 0]), 1:] = 0.0
         return touch
