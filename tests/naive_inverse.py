@@ -27,6 +27,7 @@ class NaiveInverse:
         self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
         self.contact, self.since, self.held, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
         self.samples = self.away = 0
+        self.noise, self.last = 0.0, np.zeros(3)
         self.size = np.zeros(2)
         self.earlier = 2 * ((self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy()),)
 
@@ -113,9 +114,12 @@ class NaiveInverse:
         law = self.law
         self.slow += law["high_pass"] * (deviation - self.slow)
         self.power += law["mean_square"] * ((deviation - self.slow) ** 2 - self.power)
-        if self.power > law["level"]:
+        self.last = np.array([deviation, *self.last[:2]])
+        self.noise += law["mean_square"] * 4 / 300 * ((self.last @ [1, -2, 1]) ** 2 / 6 - self.noise)
+        large = self.power > np.clip(4 * self.noise, law["level"], 25 * law["level"])
+        if large:
             self.timer = max(self.timer, 1)
-        opens = self.power > law["level"] and self.open == 0.0
+        opens = large and self.open == 0.0
         self.open = 1.0 if self.timer > 0 else max(self.open - self.p["release"], 0.0)
         self.timer -= 1
         return opens

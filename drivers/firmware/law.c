@@ -4,6 +4,8 @@
 #include <string.h>
 
 #define REVERSION 20u             /* samples between two steps of the parameters' reversion to their mean */
+#define NOISE_POLE (REAL(4e-3) / REAL(0.3)) /* of the noise at the gate, over that of the mean square over 4 ms */
+#define MOST_NOISE REAL(25.0)     /* of the stated one, as mean squares */
 #define LARGEST_MOMENT REAL(1.0)  /* N, of the levelling: a hard press may tilt the device */
 #define MOST_NEEDED REAL(20.0)    /* of the drive's limit; a reference that is scaled by more teaches nothing */
 #define HUGE_NUMBER REAL(1e6)     /* A or N: no drive, no force */
@@ -140,8 +142,14 @@ static uint32_t open_gate(law_t *law, real_t deviation)
     law->slow += d->high_pass * (deviation - law->slow);
     const real_t above = deviation - law->slow;
     law->power += d->mean_square * (above * above - law->power);
-    const uint32_t opens = ((law->power > d->level) && (law->fast_open <= REAL(0.0))) ? 1u : 0u;
-    if ((law->power > d->level) && (law->fast_timer == 0u)) {
+    const real_t *past = law->past[0];
+    const real_t second =
+        deviation - REAL(2.0) * past[(law->sample - 1u) % LAW_PAST] + past[(law->sample - 2u) % LAW_PAST];
+    law->noise += NOISE_POLE * d->mean_square * (second * second / REAL(6.0) - law->noise);
+    const real_t noise = real_max(d->level, real_min(REAL(4.0) * law->noise, MOST_NOISE * d->level));
+    const uint32_t large = (law->power > noise) ? 1u : 0u;
+    const uint32_t opens = ((large != 0u) && (law->fast_open <= REAL(0.0))) ? 1u : 0u;
+    if ((large != 0u) && (law->fast_timer == 0u)) {
         law->fast_timer = 1u;
     }
     if (law->fast_timer > 0u) {

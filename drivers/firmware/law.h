@@ -132,7 +132,7 @@ typedef struct law {
     real_t basis[LAW_BASIS], poles[2];
     real_t ring[LAW_DELAY + 1][LAW_RING];
     real_t past[2][LAW_PAST];                 /* deviations, a ring */
-    real_t slow, power, fast_open;            /* of the damper's gate */
+    real_t slow, power, noise, fast_open;     /* of the damper's gate */
     real_t damper_gain, damper_scale;         /* of the damper; the scale is a supervisor's */
     real_t damper_force[2];                   /* N, before its gain */
     real_t moment, confidence;

@@ -54,6 +54,8 @@ REVERSION = 20  # samples between two steps of the parameters' reversion to thei
 LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
 HUGE = 1e6  # drive unit: no drive
+NOISE_POLE = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
+MOST_NOISE = 25.0  # of the sensors' stated one, as mean squares
 SCALED = 0.999  # a reference scaled by less is saturated
 
 
@@ -124,13 +126,19 @@ def find_basis(controller, inverse):
 def open_gate(controller, inverse, deviation):
     """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
 
-    `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens it.
+    Noise has a mean square of `level`, (2 sigma)^2 as stated, or of four times that of second differences over sqrt 6
+    (mean over 0.3 s), at most 25 times as stated: a damper that a noisier sensor keeps open passes it on.
+    `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens the gate.
     """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     v.slow += v.high_pass * (deviation - v.slow)
     above = deviation - v.slow
     v.power += v.mean_square * (above * above - v.power)
-    large, closed = v.power > v.level, c.fast_open == 0.0
+    now = c.sample & (MOST_TAPS - 1)
+    second = deviation - 2.0 * c.past[0, (now - 1) & (MOST_TAPS - 1)] + c.past[0, (now - 2) & (MOST_TAPS - 1)]
+    v.sensed_noise += NOISE_POLE * v.mean_square * (second * second / 6.0 - v.sensed_noise)
+    noise = max(v.level, min(4.0 * v.sensed_noise, MOST_NOISE * v.level))
+    large, closed = v.power > noise, c.fast_open == 0.0
     if large:
         c.fast_timer = max(c.fast_timer, 1.0)
     c.fast_open = 1.0 if c.fast_timer > 0.0 else max(c.fast_open - c.p.release, 0.0)

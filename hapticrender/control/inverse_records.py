@@ -21,10 +21,10 @@ _CONTACT = "settling joining joined damper_time notice patience"
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
 _POLES = "level high_pass mean_square hold decay smoothing levelling slowly"
 # fade and scale of the reference, the drive's largest need; the finger's lever arm and contact, samples since it
-# changed and since a position was there; the gate's slow part and mean square; r as the sensors show it; levelling
-# force; mean squares on the untouched device, see `compare`; last sane sample of the waveform
+# changed and since a position was there; the gate's slow part, mean square and noise; r as the sensors
+# show it; levelling force; mean squares on the untouched device, see `compare`; last sane sample of the waveform
 _STATE = """
-fade peak held scale smooth_scale lever contact since away slow power reference moment
+fade peak held scale smooth_scale lever contact since away slow power sensed_noise reference moment
 nominal_power learned_power reference_power last_waveform
 """
 
