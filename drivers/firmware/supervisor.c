@@ -278,7 +278,7 @@ static real_t limit_by_heat(const supervisor_t *s)
 }
 
 /* Cut a sample's drive to the limit that its heat leaves, and pass the next sample's limit on to the law. */
-static uint32_t cool(supervisor_t *s, law_t *law, real_t drive[])
+static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
 {
     uint32_t flags = 0u;
     const real_t limit = limit_by_heat(s);
@@ -378,7 +378,7 @@ uint32_t supervisor_step(
         flags |= SUPERVISOR_STOPPED;
     }
     if (s->p->heat_pole > REAL(0.0)) {
-        flags |= cool(s, law, drive);
+        flags |= limit_rms_drive(s, law, drive);
     }
     real_t *sent = s->forces[later];
     (void)memset(sent, 0, sizeof(s->forces[later]));

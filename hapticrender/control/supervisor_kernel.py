@@ -31,8 +31,8 @@ fades out in 10 ms, in danger and after tests 10 to 12 in 2 ms, on overmotion in
 damper is turned down to 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
 Tests 3 to 5, 7 and 9 to 12 need a `Demand`, 10 to 12 at most two sensors and actuators; 6 a controller with an inner
-damper; 8 a limit.  Without them a controller has tests 1 and 2.  Where the device has a limit of rms drive, `cool`
-holds it.
+damper; 8 a limit.  Without them a controller has tests 1 and 2.  `limit_rms_drive` holds
+the device's limit of rms drive, where it has one.
 `control.supervisor` designs all of it.
 """
 
@@ -280,7 +280,7 @@ def check_ringing(supervisor):
 
 
 @kernel
-def cool(supervisor, drive, flags, n):
+def limit_rms_drive(supervisor, drive, flags, n):
     """Cut a sample's drive to the limit that its heat leaves, and return the next sample's limit.
 
     The heat h is the mean of u^2; with the rms limit L and the drive limit P, u^2 <= P^2 - (P^2/L^2 - 1) h, which is
@@ -341,7 +341,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         s.fade = max(s.fade - s.fade_step, 0.0)
         flags[n] |= STOPPED
     if p.heat_pole > 0.0:
-        limit = cool(supervisor, drive, flags, n)
+        limit = limit_rms_drive(supervisor, drive, flags, n)
         if p.limited != 0:  # the controller scales its whole envelope into it
             record(p.limited, CONTROLLER_T, 0).p.drive_limit = limit
     force0 = force1 = total = 0.0
