@@ -114,3 +114,10 @@ def test_a_chirp_beyond_the_judged_band_is_played_up_to_what_the_rate_carries():
     assert abs(recording.motion[-250:, 0]).max() > 4.5e-6  # the filters pass 0.9 of it or more
     with pytest.raises(ValueError, match=r"texture\.stop = 2300\.0: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
         hr.render(hr.Scene(texture=hr.Chirp(start=50.0, stop=2300.0, duration=1.0, amplitude=1e-6), duration=0.1))
+
+
+@pytest.mark.parametrize("fast", [replace(CHIRP, stop=3000.0), replace(TONE, frequency=3000.0)], ids=["chirp", "tone"])
+def test_no_part_of_a_playlist_or_of_a_sum_with_a_waveform_is_played_as_an_image(fast):
+    for texture in (hr.Playlist([(TONE, 0.1), (fast, 0.1)]), CHIRP + fast):
+        with pytest.raises(ValueError, match=r"3000.*: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
+            hr.prepare(hr.Scene(texture=texture, duration=0.1))
