@@ -6,6 +6,8 @@ import graphlib
 import importlib
 import inspect
 import re
+import subprocess
+import sys
 import tomllib
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -214,3 +216,9 @@ def test_commands_in_the_readme_are_in_the_makefile():
     verbs = set(re.findall(r"^([a-z-]+):.*## ", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
     named = set(re.findall(r"^make ([\w-]+)", "".join(blocks("sh")), re.MULTILINE))
     assert {"demo", "test"} <= named <= verbs
+
+
+def test_benchmarks_find_the_kernels_that_tests_have_cached():
+    """Numba names the module that compiled a kernel: `strangers_plate` here, `tests.strangers_plate` there."""
+    code = "import benchmarks.faults, strangers_plate"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
