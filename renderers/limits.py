@@ -10,9 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.control.controller_design import FADE_IN
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
+from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
@@ -163,17 +165,26 @@ def _need_of_waveform(
 
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
-    frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
+    played = target if bands.differentiated else _faded(target, model.rate)
+    frequency = np.fft.rfftfreq(len(played), 1.0 / model.rate)
     top = min(model.highest_frequency, 0.4 * model.rate) if bands.differentiated else NYQUIST_MARGIN * model.rate
     kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)  # slopes of ridges and turns are cut off
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
-    spectrum = np.where(kept, turn * np.fft.rfft(target), 0.0)
+    spectrum = np.where(kept, turn * np.fft.rfft(played), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
-    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(time))
+    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(played))
     pole = -math.expm1(-1.0 / (model.rate * scene.device_profile.limits.rms_time))
     rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())
     energy = np.cumsum(abs(spectrum) ** 2)
     ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
     return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *ends, rms)
+
+
+def _faded(target: Array, rate: float) -> Array:
+    """Target, faded in as the law does, then on by its own reflection and out: its ends meet without a step."""
+    count = min(round(FADE_IN * rate), len(target) - 1)
+    after = 2.0 * target[-1] - target[-2 : -2 - count : -1]
+    rising = smoothstep(np.arange(len(target)) / (FADE_IN * rate))
+    return np.concatenate([rising * target, smoothstep(1.0 - np.arange(1, count + 1) / count) * after])

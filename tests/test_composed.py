@@ -121,3 +121,16 @@ def test_no_part_of_a_playlist_or_of_a_sum_with_a_waveform_is_played_as_an_image
     for texture in (hr.Playlist([(TONE, 0.1), (fast, 0.1)]), CHIRP + fast):
         with pytest.raises(ValueError, match=r"3000.*: must be <= 2250 Hz, 0\.45 of the rate of 5000 Hz"):
             hr.prepare(hr.Scene(texture=texture, duration=0.1))
+
+
+@pytest.mark.parametrize("rate", [5e3, 48e3])
+def test_a_waveform_needs_what_its_frequencies_need_wherever_its_record_ends(rate):
+    """A step from the end of the record to its start has all frequencies: at 48 kHz 150 times the drive of a chirp.
+
+    A fade of 50 ms has sidebands of 20 Hz, within which the plate's stiffness rises by a tenth at 400 Hz.
+    """
+    for duration in (0.997, 1.0, 1.3):
+        scene = hr.Scene(texture=CHIRP, profile={"rate": rate}, duration=duration)
+        rendering = hr.prepare(scene)
+        tone = hr.prepare(replace(scene, texture=replace(TONE, amplitude=5e-6, frequency=400.0)))
+        assert rendering.model.demand.drive < 1.1 * tone.model.demand.drive
