@@ -134,3 +134,11 @@ def test_a_waveform_needs_what_its_frequencies_need_wherever_its_record_ends(rat
         rendering = hr.prepare(scene)
         tone = hr.prepare(replace(scene, texture=replace(TONE, amplitude=5e-6, frequency=400.0)))
         assert rendering.model.demand.drive < 1.1 * tone.model.demand.drive
+
+
+def test_a_waveform_needs_what_the_laws_filters_pass_on():
+    """Of the acceleration 0.03 at 20 kHz of 48; the whole would need 18 A, and be refused."""
+    chirp = hr.Chirp(start=2e4, stop=2e4, duration=1.0, amplitude=5e-7)
+    rendering = hr.prepare(hr.Scene(texture=chirp, profile={"rate": 48e3}, duration=0.2))
+    played = abs(hr.run(rendering).drive).max()
+    assert 0.0 < played < rendering.model.demand.drive
