@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.control.controller_design import FADE_IN
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
@@ -23,7 +24,6 @@ NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image is too close t
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster
-FADED = 20e-3  # s: at both ends of a waveform that is examined
 
 
 def check_path(scene: Scene, half: float, surface: str) -> None:
@@ -163,25 +163,30 @@ def needed(
 def _need_of_waveform(
     scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array], top: float
 ) -> Need:
-    """A target waveform up to `top` (Hz), 0.1 % of the energy left out at either side.
-
-    It comes and goes smoothly, or the edges of the window would need more drive than the texture.
-    """
+    """A target waveform up to `top` (Hz), 0.1 % of the energy left out at either side."""
     from scipy.signal import lfilter  # only waveforms need it, and its import takes a second
 
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
-    frequency = np.fft.rfftfreq(len(time), 1.0 / model.rate)
+    played = target if bands.differentiated else _faded(target, model.rate)
+    frequency = np.fft.rfftfreq(len(played), 1.0 / model.rate)
     kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
-    ends = smoothstep(np.minimum(time, time[-1] - time) / min(FADED, time[-1] / 4))
-    spectrum = np.where(kept, turn * np.fft.rfft(target * ends), 0.0)
+    spectrum = np.where(kept, turn * np.fft.rfft(played), 0.0)
     if bands.differentiated:
         target = np.fft.irfft(spectrum, len(time))
-    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(time))
+    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(played))
     pole = -math.expm1(-1.0 / (model.rate * scene.device_profile.limits.rms_time))
     rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())
     energy = np.cumsum(abs(spectrum) ** 2)
-    outer = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
-    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *outer, rms)
+    ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
+    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *ends, rms)
+
+
+def _faded(target: Array, rate: float) -> Array:
+    """Target, faded in as the law does, then on by its own reflection and out: its ends meet without a step."""
+    count = min(round(FADE_IN * rate), len(target) - 1)
+    after = 2.0 * target[-1] - target[-2 : -2 - count : -1]
+    rising = smoothstep(np.arange(len(target)) / (FADE_IN * rate))
+    return np.concatenate([rising * target, smoothstep(1.0 - np.arange(1, count + 1) / count) * after])

@@ -42,6 +42,7 @@ DEVICES = {
     "one coil": {"coils": 1},
     "late": {"delay": 3},
     "fast": {"rate": 10e3},
+    "card": {"rate": 48e3, "delay": 40},
     "bending": {"bending_frequency": 1250.0, "bending_coil": 0.1},
 }
 

@@ -47,12 +47,12 @@ def test_double_equals_the_kernel(exports, name, finger, limit):
 
 @pytest.mark.parametrize("device", DEVICES)
 def test_double_equals_the_kernel_on_other_devices(exports, device):
-    """One coordinate; a longer delay; another rate; a damper of more taps."""
+    """One coordinate; a longer delay; another rate; a sound card's; a damper of more taps."""
     parameters = PlateParameters(current_bits=0, **DEVICES[device])
-    plate = Plate(parameters, FINGERS["slide"], seed=1)
-    drive, _, flags, signals = plate.closed_loop(kernel_of(exports, device), np.zeros(5000))
+    plate, samples = Plate(parameters, FINGERS["slide"], seed=1), max(5000, round(0.4 * parameters.rate))
+    drive, _, flags, signals = plate.closed_loop(kernel_of(exports, device), np.zeros(samples))
     sensed, position = (np.ascontiguousarray(array) for array in (signals.sensed, signals.position))
-    found = exports.law(device, "double").run(sensed, position, np.zeros(5000), parameters.coils)
+    found = exports.law(device, "double").run(sensed, position, np.zeros(samples), parameters.coils)
     assert_same(found, drive[1:], flags)
     assert np.isfinite(position).any()
 

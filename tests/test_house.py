@@ -354,3 +354,9 @@ def test_cached_code_is_named_by_the_state_of_the_sources():
     assert close_loop.py_func.__qualname__ == f"close_loop_{digest()}"
     assert error_step.address > 0
     assert error_step.function.__qualname__ == f"error_step_{digest()}"
+
+
+def test_benchmarks_find_the_kernels_that_tests_have_cached():
+    """Numba names the module that compiled a kernel: `strangers_plate` here, `tests.strangers_plate` there."""
+    code = "import benchmarks.faults, strangers_plate"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0

@@ -97,6 +97,14 @@ def test_intervals_of_a_screen_hold_what_skin_leaves():
     assert min(inside.values()) >= 7
 
 
+def test_too_short_a_slide_is_refused_since_its_intervals_would_be_none():
+    """The scores of one period add to zero: its intervals were 1e-10, of two or three they hold 75 % of the time."""
+    with pytest.raises(hr.DesignError, match="more than 3 periods of 0.2 s"):
+        identify_screen(Screen(skin=5e-3), ElectroadhesionParameters(), hr.Finger.absent(), seconds=0.8)
+    found = identify_screen(Screen(skin=5e-3), ElectroadhesionParameters(), hr.Finger.absent(), seconds=1.0)
+    assert found.estimates["open_loop_gain"].interval > 10.0
+
+
 @pytest.mark.parametrize(
     ("device", "message"),
     [

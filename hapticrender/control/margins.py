@@ -177,6 +177,8 @@ def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | No
 def sensitivity(loop: Array) -> Array:
     """Largest singular value of S = (I + L)^-1, shape (...), of `loop` (..., c, c)."""
     difference = np.eye(loop.shape[-1]) + loop
+    if loop.shape[-1] == 1:
+        return 1.0 / np.abs(difference[..., 0, 0])
     if loop.shape[-1] != 2:
         return 1.0 / np.linalg.svd(difference, compute_uv=False)[..., -1]
     size = (np.abs(difference) ** 2).sum(axis=(-2, -1))
@@ -197,6 +199,8 @@ def highest_peak(height: Callable[[Array], Array], grid: Array, values: Array) -
 
 def eigenloci(loop: Array) -> Array:
     """Eigenvalues of `loop` (n, c, c), c 1 or 2, along its first axis, shape (n, c), each column continuous."""
+    if loop.shape[-1] == 1:
+        return loop[:, 0]
     loci = np.linalg.eigvals(loop)
     straight, crossed = (abs(each - loci[:-1]).sum(axis=1) for each in (loci[1:], loci[1:, ::-1]))
     swapped = np.append(False, np.cumsum(crossed < straight) % 2 == 1)

@@ -33,6 +33,7 @@ REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spaci
 RING = 10.0  # time constants of the expected mode that the drive lasts before the record
 SHARE = 0.2  # of the drive's limit: largest drive of the lines
 MODULATION = 5.0  # Hz: of the current of a screen; what c leaves of a lag of 0.4 ms is 1e-4 of the gain (20 Hz: 1e-3)
+UNKNOWNS = 3  # of a screen: mu, mu g, c
 LATE = 0.5  # samples: largest difference of the delay from the driver's
 UNEXPLAINED = 0.1  # largest share of the response that the model may leave
 
@@ -130,15 +131,19 @@ def identify_screen(
     load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
     sliding = abs(np.gradient(position, 1 / rate)) >= parameters.least_speed  # NaN, lifted, is not
     sliding[: round(rate / MODULATION)] = False
+    period = np.flatnonzero(sliding) // round(rate / MODULATION)
     if not sliding.any():
         raise DesignError(f"finger: must slide faster than {parameters.least_speed:g} m/s while the screen is measured")
+    if len(np.unique(period)) <= UNKNOWNS:  # scores of the periods add to zero: of one there would be no scatter
+        enough = f"more than {UNKNOWNS} periods of {1 / MODULATION:g} s, of which the first does not count"
+        raise DesignError(f"finger: must slide in {enough}, for intervals of what is found")
     columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
     friction = abs(sensed.sensed[sliding, 0])  # as `render` takes it: it may keep the sign of the lateral force
     _check_range(friction, parameters.force_range, "N")
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
     mu, gain = found[0], found[1] / found[0]
-    spread = _spread(columns, residual, np.flatnonzero(sliding) // round(rate / MODULATION))
+    spread = _spread(columns, residual, period)
     values = np.array([mu, gain])
     halves = np.array([spread[0], gain * math.hypot(spread[1] / found[1], spread[0] / mu)])
     changing = columns[:, 1:] @ found[1:]

@@ -140,6 +140,14 @@ class _Composed(Composable):
     def _follows_finger(self) -> bool:
         return all(lies_along_surface(texture) for texture, _ in self.parts)
 
+    def _bands_of_parts(self, rate: float) -> list[Bands]:
+        """Bands of every part; a ValueError where `rate` (Hz) carries none of a part's, not even the lowest."""
+        found = [texture.bands(rate) for texture, _ in self.parts]
+        lowest = max(float(bands.frequency.min()) if len(bands) else 0.0 for bands in found)
+        bound = f"<= {HIGHEST * rate:g} Hz, {HIGHEST} of the rate of {rate:g} Hz"
+        require(lowest <= HIGHEST * rate, "texture.frequency", lowest, bound)
+        return found
+
     def check(self) -> None:
         """Read the files of all parts."""
         for texture, _ in self.parts:
@@ -175,7 +183,8 @@ class Sum(Validated, _Composed):
 
     def bands(self, rate: float) -> Bands:
         """Bands of all parts for sampling at `rate` (Hz), equal carriers as one."""
-        found = [(texture.bands(rate), gain) for texture, gain in self.parts]
+        gains = [gain for _, gain in self.parts]
+        found = list(zip(self._bands_of_parts(rate), gains, strict=True))
         if len(found) == 1 and found[0][0].envelope is None:
             return found[0][0]
         if any(bands.envelope is None for bands, _ in found):
@@ -217,7 +226,8 @@ class Playlist(Validated, _Composed):
     fade: float = parameter(5e-3, unit="s", about="in which a part comes and goes; friction is the slope of a texture")
 
     def bands(self, rate: float) -> Bands:
-        """No carriers (`rate` in Hz is not needed): the whole waveform is played."""
+        """No carriers: the whole waveform is played; a ValueError where `rate` (Hz) does not carry a part's."""
+        self._bands_of_parts(rate)
         return Bands.none(spatial=self._follows_finger)
 
     def waveform(self, time: Array, position: Array) -> Array:
