@@ -18,7 +18,7 @@ from hapticrender.protocols import Array, Flag, Sensed
 
 FORMATS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".aiff": "AIFF", ".aif": "AIFF", ".flac": "FLAC"}
 SUBTYPES = {"PCM_16": 16, "PCM_24": 24, "PCM_32": 32, "FLOAT": None, "DOUBLE": None}  # bits of the integers
-MARK = "hapticrender drive"  # begins the comment of a file, by which a later run knows it
+MARK = "hapticrender drive"  # the comment of a file of this driver begins with it
 WIDTH = 32  # soundfile takes integers of any width left-justified in 32 bits
 
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from hapticrender.protocols import Array
 
+NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image is too close to the carrier
+
 
 def hold_last(position: Array) -> Array:
     """Position (m, shape (n,)) with every NaN replaced by the last finite value before it (0 where there is none)."""

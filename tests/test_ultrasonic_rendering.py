@@ -60,7 +60,7 @@ def held(load):
     return hr.Finger.still(normal_load=load) if load else FREE
 
 
-def ran(wanted, seconds, finger=FREE, settings=None, **plant):
+def ran(wanted, seconds, finger=FREE, settings=None, seed=0, **plant):
     """The plate under its own loop; `wanted` (m) over time (s); `settings` of the loop that differ."""
     parameters = SurfaceParameters.with_overrides(plant)
     mode, loop = parameters.carrier_mode, amplitude_loop(parameters)
@@ -68,7 +68,7 @@ def ran(wanted, seconds, finger=FREE, settings=None, **plant):
         loop.state["p"][name] = value
     time = np.arange(round(seconds * mode.rate)) / mode.rate
     asked = np.broadcast_to(np.asarray(wanted(time) if callable(wanted) else wanted, float), time.shape).copy()
-    drive, _, flags, sensed = UltrasonicPlate(mode, finger).closed_loop(loop, asked)
+    drive, _, flags, sensed = UltrasonicPlate(mode, finger, seed=seed).closed_loop(loop, asked)
     return Run(time, asked, abs(hilbert(sensed.motion[:, 0])), drive[:, 0], flags, loop, mode)
 
 

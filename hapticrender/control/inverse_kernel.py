@@ -44,7 +44,7 @@ from hapticrender.control.inverse_records import (
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
 from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
-from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, TILE_T, Y, samples_of
+from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, PAST_MASK, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, put, real, total, zeros
@@ -134,8 +134,7 @@ def open_gate(controller, inverse, deviation):
     v.slow += v.high_pass * (deviation - v.slow)
     above = deviation - v.slow
     v.power += v.mean_square * (above * above - v.power)
-    now = c.sample & (MOST_TAPS - 1)
-    second = deviation - 2.0 * c.past[0, (now - 1) & (MOST_TAPS - 1)] + c.past[0, (now - 2) & (MOST_TAPS - 1)]
+    second = deviation - 2.0 * c.past[0, (c.sample - 1) & PAST_MASK] + c.past[0, (c.sample - 2) & PAST_MASK]
     v.sensed_noise += NOISE_POLE * v.mean_square * (second * second / 6.0 - v.sensed_noise)
     noise = max(v.level, min(4.0 * v.sensed_noise, MOST_NOISE * v.level))
     large, closed = v.power > noise, c.fast_open == 0.0
@@ -151,11 +150,11 @@ def open_gate(controller, inverse, deviation):
 def damp(controller, coordinate, deviation):
     """Force of the inner damper, F = -sum taps eps[n - j], and `damper_force` before its gain; `past` is a ring."""
     c = record(controller, CONTROLLER_T, 0)
-    now, force = c.sample & (MOST_TAPS - 1), 0.0
+    now, force = c.sample & PAST_MASK, 0.0
     c.past[coordinate, now] = deviation
     if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
-            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & (MOST_TAPS - 1)]
+            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & PAST_MASK]
     c.damper_force[coordinate] = force
     return c.damping_gain * force
 
@@ -288,10 +287,7 @@ def inverse_step(state, signals, start, count):
             reset_parameters(inverse, 0, PARAMETERS)
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
-                error0, error1 = (
-                    c.past[0, (c.sample - 1) & (MOST_TAPS - 1)],
-                    c.past[1, (c.sample - 1) & (MOST_TAPS - 1)],
-                )
+                error0, error1 = c.past[0, (c.sample - 1) & PAST_MASK], c.past[1, (c.sample - 1) & PAST_MASK]
             elif (
                 open_gate(state, inverse, error0)
                 and v.since > v.joined

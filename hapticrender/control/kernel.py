@@ -34,6 +34,7 @@ from hapticrender.control.records import (
     INVERSE,
     LEAK,
     MOST_TAPS,
+    PAST_MASK,
     POSITION,
     STEP,
     SUM,
@@ -151,7 +152,7 @@ def innovate_sample(controller):
     the command.
     """
     c = record(controller, CONTROLLER_T, 0)
-    samples, now, p = samples_of(controller), c.sample & (MOST_TAPS - 1), c.p
+    samples, now, p = samples_of(controller), c.sample & PAST_MASK, c.p
     gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
     drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(p.coordinates):
@@ -163,7 +164,7 @@ def innovate_sample(controller):
         force = 0.0
         if c.damping_gain > 0.0 or c.damper_scale < 1.0:
             for j in range(p.n_taps):
-                force -= p.taps[i, j] * c.past[i, (now - j) & (MOST_TAPS - 1)]
+                force -= p.taps[i, j] * c.past[i, (now - j) & PAST_MASK]
         c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
         error = samples[Y + i, 0] - shown - c.dc[i]
         samples[Y + i, 0] = error

@@ -23,7 +23,8 @@ from hapticrender.protocols import Array
 from hapticrender.vectors import W, tile_type
 
 MOST_SENSORS = MOST_CHANNELS = 8
-MOST_TAPS = 64  # of the inner damper, a power of two: its deviations are a ring
+MOST_TAPS = 64  # of the inner damper, a power of two
+PAST_MASK = MOST_TAPS - 1  # of an index of the ring of its deviations
 LEAK = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
 FIXED, FADING, LOCKED = range(3)  # modes of a tile: nothing changes; its targets do; its carriers follow the finger
 SETPOINT_ROWS = 7  # frequency (Hz), wavenumber (1/m), phase (turns), target (re, im), sensor response (re, im)

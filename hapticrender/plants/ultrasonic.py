@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hapticrender.bands import NYQUIST_MARGIN
 from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
@@ -28,7 +29,6 @@ NOMINAL_LOAD = 0.5  # N: at which `finger_damping` and `finger_shift` hold
 MOST_LOAD = 20.0  # N: largest load
 MOST_DAMPING_RATIO = 0.5
 MOST_SHIFT = 0.25  # of the carrier
-NYQUIST_MARGIN = 0.45  # of the rate: the carrier must lie below
 WARMING = 1000  # steps a second in which the temperature rises
 
 

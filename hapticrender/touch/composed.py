@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hapticrender import checks
-from hapticrender.bands import Bands
+from hapticrender.bands import NYQUIST_MARGIN, Bands
 from hapticrender.checks import Validated, checked, parameter, require
 from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Texture
@@ -21,7 +21,7 @@ LONGEST_PART = 360_000.0  # s
 MOST_CHIRP = 0.01  # m
 READINGS, PLACES = 0.0123 * 10.0 ** np.arange(6), np.linspace(-0.15, 0.15, 1001)  # s, m: where a texture is tried
 SOON = READINGS[:3]  # s
-NOMINAL_RATE, HIGHEST = 5000.0, 0.45  # Hz; of the rate
+NOMINAL_RATE = 5000.0  # Hz
 
 Parts = tuple[tuple[Texture, float], ...]
 
@@ -144,8 +144,8 @@ class _Composed(Composable):
         """Bands of every part; a ValueError where `rate` (Hz) carries none of a part's, not even the lowest."""
         found = [texture.bands(rate) for texture, _ in self.parts]
         lowest = max(float(bands.frequency.min()) if len(bands) else 0.0 for bands in found)
-        bound = f"<= {HIGHEST * rate:g} Hz, {HIGHEST} of the rate of {rate:g} Hz"
-        require(lowest <= HIGHEST * rate, "texture.frequency", lowest, bound)
+        bound = f"<= {NYQUIST_MARGIN * rate:g} Hz, {NYQUIST_MARGIN} of the rate of {rate:g} Hz"
+        require(lowest <= NYQUIST_MARGIN * rate, "texture.frequency", lowest, bound)
         return found
 
     def check(self) -> None:
@@ -265,9 +265,9 @@ class Chirp(Validated, Composable):
 
     def bands(self, rate: float) -> Bands:
         """No carriers: the whole waveform is played; a ValueError where `rate` (Hz) does not carry it."""
-        bound = f"<= {HIGHEST * rate:g} Hz, {HIGHEST} of the rate of {rate:g} Hz"
+        bound = f"<= {NYQUIST_MARGIN * rate:g} Hz, {NYQUIST_MARGIN} of the rate of {rate:g} Hz"
         for name, frequency in (("start", self.start), ("stop", self.stop)):
-            require(frequency <= HIGHEST * rate, f"texture.{name}", frequency, bound)
+            require(frequency <= NYQUIST_MARGIN * rate, f"texture.{name}", frequency, bound)
         return Bands.none(spatial=False)
 
     def waveform(self, time: Array, position: Array) -> Array:
