@@ -26,12 +26,13 @@ HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
 _CONTROLLER = """
-drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force shape
+drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force pattern
 damper_high release
 """.split()
 _LAW = """
-mass damping stiffness lever_per_metre level high_pass mean_square filters sensor_filter pair hertz_scale pole
-pole_damping fade_step decay smoothing noise model_error levelling prior start spread
+mass damping stiffness lever_per_metre gate_threshold high_pass_pole mean_square_pole filters sensor_filter pole_step
+omega_n pole pole_damping fade_step decay scale_pole noise model_error levelling_pole prior initial_variance
+prior_covariance
 """.split()
 _SUPERVISION = """
 invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole ring_corner ring_shape ring_pole
@@ -42,7 +43,7 @@ _TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension b
 _GAINS = """
 scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
 """.split()
-_SAMPLES = "damper_time hold settling joining joined notice patience".split()
+_SAMPLES = "damper_time hold learning_delay relearning_delay initial_end report_delay loss_time".split()
 
 
 def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = False) -> list[Path]:
@@ -108,7 +109,7 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
         **{name: settings[name] for name in _CONTROLLER},
         **{name: law[name] for name in _LAW},
         **{name: int(law[name]) for name in _SAMPLES},
-        "lost": 1.0 - law["kept"],
+        "reversion_step": 1.0 - law["reversion_factor"],
         "taps": settings["taps"][:, :taps],
         "force_from_drive": law["force_from_drive"][:, :channels],
         "change_step": period / CHANGE,

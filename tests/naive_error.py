@@ -32,7 +32,7 @@ class NaiveError:
         self.set, self.shown = setpoints[3] + 1j * setpoints[4], setpoints[5] + 1j * setpoints[6]
         self.K, self.T = len(self.frequency), 1 / p["rate"]
         self.M, self.C, self.S = (p[name][:n, :n] for name in ("mass", "damping", "stiffness"))
-        self.shape, self.taps = p["shape"][:n, None], p["taps"][:n, : p["n_taps"]]
+        self.shape, self.taps = p["pattern"][:n, None], p["taps"][:n, : p["n_taps"]]
         self.from_sensor = p["coordinate_from_sensor"][:n, : p["sensors"]]
         self.to_drive = p["drive_from_force"][: p["channels"], :n]
         self.locked = bool((self.wavenumber > 0).any() or p["needs_contact"])
@@ -180,7 +180,7 @@ class NaiveError:
             return False, False
         self.fast = self.fast + p["fast_pole"] * (deviation - self.fast)
         self.slow = self.slow + p["slow_pole"] * (deviation - self.slow)
-        return (abs(self.fast) ** 2 > p["fast_level"]).any(), (abs(self.slow) ** 2 > p["slow_level"]).any()
+        return (abs(self.fast) ** 2 > p["fast_threshold"]).any(), (abs(self.slow) ** 2 > p["slow_threshold"]).any()
 
     def finger(self):
         """Finger estimate z(j w) of every band, and its slope."""

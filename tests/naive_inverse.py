@@ -1,4 +1,4 @@
-"""Slow, obvious twin of the waveform law, sample by sample, from the equations of docs/theory.md.
+"""Slow, obvious twin of the waveform law, sample by sample, from docs/theory.md, "The waveform law", in its symbols.
 
 It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law; the drive is not
 rounded.  The reference comes `ahead` samples early, as a number a sample.
@@ -19,13 +19,13 @@ class NaiveInverse:
         self.from_sensor = p["coordinate_from_sensor"][:, : p["sensors"]]
         self.to_drive = p["drive_from_force"][: p["channels"]]
         self.to_force = law["force_from_drive"][:, : p["channels"]]
-        self.s, self.taps, self.n = p["shape"], p["taps"][:, : p["n_taps"]], n
-        self.theta, self.P = law["prior"].copy(), law["spread"].copy()
-        self.psi = np.zeros((4, COUNT + 1))  # states of the regressors, and of w
+        self.alpha, self.taps, self.n = p["pattern"], p["taps"][:, : p["n_taps"]], n
+        self.theta, self.P = law["prior"].copy(), law["prior_covariance"].copy()
+        self.psi = np.zeros((4, COUNT + 1))  # states of the regressors, and of dev_u
         self.references, self.forces = [], []  # r, early; basis and deviation force of each sample
         self.poles, self.basis, self.past = np.zeros(2), np.zeros(6), np.zeros((2, self.taps.shape[1]))
         self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
-        self.contact, self.since, self.held, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
+        self.contact, self.since, self.hold_left, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
         self.samples = self.away = 0
         self.noise, self.last = 0.0, np.zeros(3)
         self.size = np.zeros(2)
@@ -36,27 +36,27 @@ class NaiveInverse:
         law, p, n = self.law, self.p, self.samples
         y = self.from_sensor @ sensed
         settled = self.follow(int(np.isfinite(position)), position)
-        wanted = self.contact or not law["spatial"]
-        self.fade = np.clip(self.fade + (law["fade_step"] if wanted else -law["fade_step"]), 0, 1)
+        plays = self.contact or not law["spatial"]
+        self.fade = np.clip(self.fade + (law["fade_step"] if plays else -law["fade_step"]), 0, 1)
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
         now = self.reference(n - law["delay"] - 6)
-        e = y - self.s * now
-        if self.gate(e[0]) and self.since > law["joined"] and self.contact:
-            self.suspect()
-        self.past = np.column_stack([e, self.past[:, :-1]])
+        dev = y - self.alpha * now
+        if self.gate(dev[0]) and self.since > law["initial_end"] and self.contact:
+            self.suspect_lift()
+        self.past = np.column_stack([dev, self.past[:, :-1]])
         if settled:
             for i in range(self.n):
-                self.learn(i, e[i])
+                self.learn(i, dev[i])
         if n % 20 == 0:
             self.revert()
         if n % 25 == 0:
             self.discretise()
-        phi, d1, d2 = self.find_basis(n)
-        nominal = self.K @ self.s * phi[0] + self.C @ self.s * d1 + self.M @ self.s * d2
-        force = nominal + self.directions() @ self.theta[:COUNT] + self.level()
+        beta, d1, d2 = self.find_basis(n)
+        nominal = self.K @ self.alpha * beta[0] + self.C @ self.alpha * d1 + self.M @ self.alpha * d2
+        force = nominal + self.directions() @ self.theta[:COUNT] + self.levelling_force()
         force = force - (self.open * p["damper_high"]) * (self.taps * self.past).sum(axis=1)
         drive = self.play(force)
-        self.forces.append((phi, self.to_force @ drive - nominal))
+        self.forces.append((beta, self.to_force @ drive - nominal))
         self.advance(n)
         self.samples += 1
         return drive
@@ -72,51 +72,51 @@ class NaiveInverse:
             self.lever = np.clip(law["lever_per_metre"] * position, -2.0, 2.0)
         self.since += 1
         self.away = 0 if touching else self.away + 1
-        touching = touching or int(self.contact and self.away < law["patience"])
+        touching = touching or int(self.contact and self.away < law["loss_time"])
         if touching != self.contact:
             self.contact, self.since, self.timer = touching, 0, law["damper_time"]
-            self.forget(FINGER, HEAVE)
-            self.forget(LOAD, COUNT)
+            self.reset(FINGER, HEAVE)
+            self.reset(LOAD, COUNT)
             self.discretise()
-        elif self.since in (law["settling"], law["joining"]):
+        elif self.since in (law["learning_delay"], law["relearning_delay"]):
             self.theta[HEAVE:LOAD] = self.earlier[0][0]
-            self.P[:] = law["spread"]
+            self.P[:] = law["prior_covariance"]
             self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0][1]
             self.earlier = self.earlier[0], self.earlier[0]
-            self.take_motion()
-        elif self.since == law["joined"]:
-            self.forget(INITIAL, COUNT)
-        elif self.since > law["joined"] and self.samples % law["notice"] == 0:
+            self.restart_regressors()
+        elif self.since == law["initial_end"]:
+            self.reset(INITIAL, COUNT)
+        elif self.since > law["initial_end"] and self.samples % law["report_delay"] == 0:
             self.earlier = self.earlier[1], (self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy())
-        return self.since >= law["settling"]
+        return self.since >= law["learning_delay"]
 
-    def take_motion(self):
+    def restart_regressors(self):
         self.psi[:] = 0.0
         self.psi[:, INITIAL:COUNT] = np.eye(4)
         self.theta[INITIAL:] = 0.0
-        self.P[INITIAL:, INITIAL:] = np.diag(self.law["start"])
+        self.P[INITIAL:, INITIAL:] = np.diag(self.law["initial_variance"])
 
-    def suspect(self):
-        self.P[LOAD:] = self.law["spread"][LOAD:]
-        self.P[:, LOAD:] = self.law["spread"][:, LOAD:]
+    def suspect_lift(self):
+        self.P[LOAD:] = self.law["prior_covariance"][LOAD:]
+        self.P[:, LOAD:] = self.law["prior_covariance"][:, LOAD:]
         self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
-        self.take_motion()
-        self.since = self.law["joining"]
+        self.restart_regressors()
+        self.since = self.law["relearning_delay"]
 
-    def forget(self, first, last):
+    def reset(self, first, last):
         inside = slice(first, last)
         self.theta[inside] = self.law["prior"][inside]
         self.P[inside, :] = self.P[:, inside] = 0.0
-        self.P[inside, inside] = self.law["spread"][inside, inside]
+        self.P[inside, inside] = self.law["prior_covariance"][inside, inside]
         self.psi[:, inside] = 0.0
 
     def gate(self, deviation):
         law = self.law
-        self.slow += law["high_pass"] * (deviation - self.slow)
-        self.power += law["mean_square"] * ((deviation - self.slow) ** 2 - self.power)
+        self.slow += law["high_pass_pole"] * (deviation - self.slow)
+        self.power += law["mean_square_pole"] * ((deviation - self.slow) ** 2 - self.power)
         self.last = np.array([deviation, *self.last[:2]])
-        self.noise += law["mean_square"] * 4 / 300 * ((self.last @ [1, -2, 1]) ** 2 / 6 - self.noise)
-        large = self.power > np.clip(4 * self.noise, law["level"], 25 * law["level"])
+        self.noise += law["mean_square_pole"] * 4 / 300 * ((self.last @ [1, -2, 1]) ** 2 / 6 - self.noise)
+        large = self.power > np.clip(4 * self.noise, law["gate_threshold"], 25 * law["gate_threshold"])
         if large:
             self.timer = max(self.timer, 1)
         opens = large and self.open == 0.0
@@ -124,32 +124,32 @@ class NaiveInverse:
         self.timer -= 1
         return opens
 
-    def learn(self, i, error):
-        h = -self.psi[i, :COUNT]
-        explained = self.psi[i, COUNT]
-        self.size[i] += self.law["mean_square"] * (error**2 + explained**2 - self.size[i])
-        innovation = error - explained - h @ self.theta
-        gain = self.P @ h / (h @ self.P @ h + self.law["noise"][i] + self.law["model_error"] * self.size[i])
-        self.theta = self.theta + gain * innovation
-        self.P = self.P - np.outer(gain, h @ self.P)
+    def learn(self, i, dev):
+        psi, dev_u = self.psi[i, :COUNT], self.psi[i, COUNT]
+        self.size[i] += self.law["mean_square_pole"] * (dev**2 + dev_u**2 - self.size[i])
+        e = dev - dev_u + psi @ self.theta
+        noise = self.law["noise"][i] + self.law["model_error"] * self.size[i]
+        gain = self.P @ psi / (psi @ self.P @ psi + noise)
+        self.theta = self.theta - gain * e
+        self.P = self.P - np.outer(gain, psi @ self.P)
 
     def revert(self):
         law = self.law
-        kept = np.outer(law["kept"], law["kept"])
-        self.theta = law["prior"] + law["kept"] * (self.theta - law["prior"])
-        self.P = kept * self.P + (1 - kept) * law["spread"]
+        factor = np.outer(law["reversion_factor"], law["reversion_factor"])
+        self.theta = law["prior"] + law["reversion_factor"] * (self.theta - law["prior"])
+        self.P = factor * self.P + (1 - factor) * law["prior_covariance"]
 
     def discretise(self):
-        law, th, scale = self.law, self.theta, self.law["hertz_scale"]
+        law, th, w_n = self.law, self.theta, self.law["omega_n"]
         s, pole = 2j * np.pi * 180.0, law["pole"]
         low = s**2 + 2 * law["pole_damping"] * pole * s + pole**2
-        z = th[0] + th[1] * s / scale + th[2] * (s / scale) ** 2 + th[3] * pole**2 / low + th[4] * pole * s / low
+        z = th[0] + th[1] * s / w_n + th[2] * (s / w_n) ** 2 + th[3] * pole**2 / low + th[4] * pole * s / low
         mass, damping = np.clip(z.real / (s**2).real, -2e-3, 10e-3), np.clip(z.imag / s.imag, 0.0, 12.0)
         arm = np.outer([1.0, self.lever], [1.0, self.lever]) * self.contact
 
         def learned(matrix, order, both):
             own = matrix.diagonal()
-            heave, coupling = th[[HEAVE + order, COUPLING + order]] / scale**order
+            heave, coupling = th[[HEAVE + order, COUPLING + order]] / w_n**order
             coupling = np.clip(coupling, -0.2 * own[1], 0.2 * own[1])
             change = np.diag(np.clip([heave, heave if both else 0.0], -0.7 * own, 4.0 * own))
             return matrix + change + coupling * np.eye(2)[::-1]
@@ -159,48 +159,46 @@ class NaiveInverse:
         flow = np.zeros((6, 6))
         flow[:2, 2:4] = np.eye(2)
         flow[2:4] = np.linalg.solve(M, np.hstack([-K, -C, np.eye(2)]))
-        held = expm(flow * self.T)
-        self.Phi, self.Gamma = held[:4, :4], held[:4, 4:]
+        step = expm(flow * self.T)
+        self.Phi, self.Gamma = step[:4, :4], step[:4, 4:]
 
     def find_basis(self, n):
-        law, scale = self.law, self.law["hertz_scale"]
+        law, w_n = self.law, self.law["omega_n"]
         window = np.array([self.references[k] if k >= 0 else 0.0 for k in range(n - 11, n + 1)])
         d = law["filters"] @ window
         last, x = self.basis[0], self.poles
-        self.poles = law["pair"] @ [x[0], x[1], last, d[0]]
+        self.poles = law["pole_step"] @ [x[0], x[1], last, d[0]]
         delay = (self.M[0, 0] * d[3] + self.C[0, 0] * d[2] + self.K[0, 0] * d[1]) * self.T
         pole = law["pole"]
-        self.basis = np.array(
-            [d[0], d[1] / scale, d[2] / scale**2, pole**2 * self.poles[0], pole * self.poles[1], delay]
-        )
+        self.basis = np.array([d[0], d[1] / w_n, d[2] / w_n**2, pole**2 * self.poles[0], pole * self.poles[1], delay])
         return self.basis, d[1], d[2]
 
     def directions(self, basis=None):
         """Force of each parameter per unit, shape (2, COUNT); load and initial motion are not played."""
         basis = self.basis if basis is None else basis
         found = np.zeros((2, COUNT))
-        along = self.contact * (self.s[0] + self.lever * self.s[1])
+        along = self.contact * (self.alpha[0] + self.lever * self.alpha[1])
         found[:, FINGER:HEAVE] = along * np.outer([1.0, self.lever], basis[:5])
-        found[0, HEAVE : HEAVE + 4] = self.s[0] * basis[[0, 1, 2, 5]]
+        found[0, HEAVE : HEAVE + 4] = self.alpha[0] * basis[[0, 1, 2, 5]]
         found[1, COUPLING : COUPLING + 3] = basis[:3]
         return found
 
-    def level(self):
-        wanted = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)
-        self.moment += self.law["levelling"] * (wanted - self.moment)
+    def levelling_force(self):
+        target = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)
+        self.moment += self.law["levelling_pole"] * (target - self.moment)
         return np.array([0.0, self.moment])
 
     def play(self, force):
         p, law = self.p, self.law
         exact = self.to_drive @ force
         needed = abs(exact).max() / p["drive_limit"] / self.smooth
-        self.held -= 1
+        self.hold_left -= 1
         if needed >= 0.98 * self.peak:
-            self.peak, self.held = min(max(self.peak, needed), 20.0), law["hold"]
-        elif self.held < 0:
+            self.peak, self.hold_left = min(max(self.peak, needed), 20.0), law["hold"]
+        elif self.hold_left < 0:
             self.peak *= law["decay"]
-        self.scale += law["smoothing"] * (1 / max(self.peak, 1.0) - self.scale)
-        self.smooth += law["smoothing"] * (self.scale - self.smooth)
+        self.scale += law["scale_pole"] * (1 / max(self.peak, 1.0) - self.scale)
+        self.smooth += law["scale_pole"] * (self.scale - self.smooth)
         return np.clip(exact, -p["drive_limit"], p["drive_limit"])
 
     def advance(self, n):

@@ -91,9 +91,9 @@ class NaiveLowPass(NaiveError):
     def complex(self, y, carrier):
         p, n, omega, r, weight = self.p, len(y), self.w, self.R, self.weight
         mass, damping, stiffness = (p[name][:n, :n, None] for name in ("mass", "damping", "stiffness"))
-        wanted = p["shape"][:n, None] * r
+        wanted = p["pattern"][:n, None] * r
         if p["deviation"]:
-            y = y - p["shape"][:n] * (r * carrier).real.sum()
+            y = y - p["pattern"][:n] * (r * carrier).real.sum()
         v = np.zeros_like(self.V)
         if p["feedback"]:
             x = self.estimate(y, carrier)

@@ -99,7 +99,7 @@ class TunedBlock:
     """
 
     names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "forget", "ramp", "fast_pole")
-    names += ("slow_pole", "fast_level", "slow_level", "limit", "sensed_limit", "step")
+    names += ("slow_pole", "fast_threshold", "slow_threshold", "limit", "sensed_limit", "step")
 
     def __init__(self, controller):
         p, state, tiles = controller.settings, controller.state[0], controller.tiles
@@ -125,7 +125,7 @@ class TunedBlock:
             "sensed_limit": p["sensor_limit"],
             "step": p["drive_step"],
         }
-        rest = [p["coordinate_from_sensor"][:, :2], speak, p["shape"], state["shaper"][:, :2]]
+        rest = [p["coordinate_from_sensor"][:, :2], speak, p["pattern"], state["shaper"][:, :2]]
         numbers = [[values[name] for name in self.names], *(each.ravel() for each in rest)]
         self.numbers = np.concatenate(numbers).astype(float)
         options = [f"-DR_{name}={value}" for name, value in sorted(AT.items())]

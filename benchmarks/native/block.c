@@ -12,8 +12,8 @@ typedef long mask __attribute__((vector_size(64)));
 
 typedef struct {
     double rate, block_rate, g, dc, dc_drift, lead, integral, back, forget, ramp;
-    double fast_pole, slow_pole, fast_level, slow_level, limit, sensed_limit, step;
-    double listen[2][2], speak[2][2], shape[2], rounding[2][2];
+    double fast_pole, slow_pole, fast_threshold, slow_threshold, limit, sensed_limit, step;
+    double listen[2][2], speak[2][2], pattern[2], rounding[2][2];
 } Numbers;
 
 static const double S[] = {POLY_S}, C[] = {POLY_C};
@@ -67,8 +67,8 @@ void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables
             band[R_SEEN_RE] = 0.5 * (re + band[R_R_RE]), band[R_SEEN_IM] = 0.5 * (im + band[R_R_IM]);
             band[R_R_RE] = re, band[R_R_IM] = im;
             for (int i = 0; i < 2; i++, loop += R_LOOP_ROWS) {
-                v a = n->shape[i] * band[R_SEEN_RE] + loop[R_E_RE];
-                v z = n->shape[i] * band[R_SEEN_IM] + loop[R_E_IM];
+                v a = n->pattern[i] * band[R_SEEN_RE] + loop[R_E_RE];
+                v z = n->pattern[i] * band[R_SEEN_IM] + loop[R_E_IM];
                 held[2 * i] = a * c - z * s, held[2 * i + 1] = a * s + z * c;
             }
         }
@@ -150,11 +150,11 @@ void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables
                 v *own = loop + R_LOOP_ROWS * c, fast2 = {}, slow2 = {};
                 v found[2] = {a[2 * c] * cosine + a[2 * c + 1] * sine, a[2 * c + 1] * cosine - a[2 * c] * sine};
                 for (int r = 0; r < 2; r++) {
-                    v e = own[R_E_RE + r], x = own[R_V_RE + r], wanted = n->shape[c] * band[R_R_RE + r];
+                    v e = own[R_E_RE + r], x = own[R_V_RE + r], wanted = n->pattern[c] * band[R_R_RE + r];
                     v heard = e - x + (2.0 / block) * found[r];
                     e = (1 - period * fading) * e + share * n->g * found[r];
                     v slope = -n->integral * e - n->back * (x + wanted) - fading * x;
-                    v steeper = n->shape[c] * band[R_DR_RE + r];
+                    v steeper = n->pattern[c] * band[R_DR_RE + r];
                     x += period * slope;
                     own[R_E_RE + r] = e, own[R_V_RE + r] = x;
                     own[R_COMMAND_RE + r] = x + wanted + n->lead * steeper;
@@ -163,7 +163,7 @@ void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables
                     own[R_SLOW_RE + r] += n->slow_pole * (own[R_FAST_RE + r] - own[R_SLOW_RE + r]);
                     fast2 += own[R_FAST_RE + r] * own[R_FAST_RE + r], slow2 += own[R_SLOW_RE + r] * own[R_SLOW_RE + r];
                 }
-                heard_fast += most(fast2 - n->fast_level, 0), heard_slow += most(slow2 - n->slow_level, 0);
+                heard_fast += most(fast2 - n->fast_threshold, 0), heard_slow += most(slow2 - n->slow_threshold, 0);
             }
             for (int channel = 0; channel < 2; channel++, held += R_CHANNEL_ROWS) {
                 v re = {}, im = {}, *now = held + 4;

@@ -117,14 +117,14 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
     }
     real_t poles[2];
     for (uint32_t i = 0u; i < 2u; i++) {
-        poles[i] = d->pair[i][0] * law->poles[0] + d->pair[i][1] * law->poles[1] + d->pair[i][2] * law->basis[0]
-            + d->pair[i][3] * r[0];
+        const real_t *step = d->pole_step[i];
+        poles[i] = step[0] * law->poles[0] + step[1] * law->poles[1] + step[2] * law->basis[0] + step[3] * r[0];
     }
     law->poles[0] = poles[0];
     law->poles[1] = poles[1];
     law->basis[0] = r[0];
-    law->basis[1] = r[1] / d->hertz_scale;
-    law->basis[2] = r[2] / (d->hertz_scale * d->hertz_scale);
+    law->basis[1] = r[1] / d->omega_n;
+    law->basis[2] = r[2] / (d->omega_n * d->omega_n);
     law->basis[3] = d->pole * d->pole * poles[0];
     law->basis[4] = d->pole * poles[1];
     law->basis[5] = (d->mass[0][0] * r[3] + d->damping[0][0] * r[2] + d->stiffness[0][0] * r[1]) / d->rate;
@@ -139,14 +139,14 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
 static uint32_t open_gate(law_t *law, real_t deviation)
 {
     const design_t *d = law->design;
-    law->slow += d->high_pass * (deviation - law->slow);
+    law->slow += d->high_pass_pole * (deviation - law->slow);
     const real_t above = deviation - law->slow;
-    law->power += d->mean_square * (above * above - law->power);
+    law->power += d->mean_square_pole * (above * above - law->power);
     const real_t *past = law->past[0];
     const real_t second =
         deviation - REAL(2.0) * past[(law->sample - 1u) % LAW_PAST] + past[(law->sample - 2u) % LAW_PAST];
-    law->noise += NOISE_POLE * d->mean_square * (second * second / REAL(6.0) - law->noise);
-    const real_t noise = real_max(d->level, real_min(REAL(4.0) * law->noise, MOST_NOISE * d->level));
+    law->noise += NOISE_POLE * d->mean_square_pole * (second * second / REAL(6.0) - law->noise);
+    const real_t noise = real_max(d->gate_threshold, real_min(REAL(4.0) * law->noise, MOST_NOISE * d->gate_threshold));
     const uint32_t large = (law->power > noise) ? 1u : 0u;
     const uint32_t opens = ((large != 0u) && (law->fast_open <= REAL(0.0))) ? 1u : 0u;
     if ((large != 0u) && (law->fast_timer == 0u)) {
@@ -162,7 +162,7 @@ static uint32_t open_gate(law_t *law, real_t deviation)
     return opens;
 }
 
-/* Force of the inner damper, F = -sum taps eps[n - j]. */
+/* Force of the inner damper, F = -sum c_j dev[n - j]. */
 static real_t damp(law_t *law, uint32_t coordinate, real_t deviation)
 {
     real_t force = REAL(0.0);
@@ -196,9 +196,9 @@ static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns
 {
     const design_t *d = law->design;
     const real_t error[2] = {
-        coordinates[0] - d->shape[0] * law->reference, coordinates[1] - d->shape[1] * law->reference};
-    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->joined) && (law->learning.contact != 0u)) {
-        learning_suspect(law);
+        coordinates[0] - d->pattern[0] * law->reference, coordinates[1] - d->pattern[1] * law->reference};
+    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->initial_end) && (law->learning.contact != 0u)) {
+        learning_suspect_lift(law);
     }
     if (learns != 0u) {
         learning_update(law, error);
@@ -222,24 +222,24 @@ static void nominal_force(law_t *law, real_t force[2])
             of[i][j] = d->stiffness[i][j] * law->basis[0] + d->damping[i][j] * rate + d->mass[i][j] * acceleration;
         }
     }
-    force[0] = d->shape[0] * of[0][0] + d->shape[1] * of[0][1];
-    force[1] = d->shape[0] * of[0][1] + d->shape[1] * of[1][1];
+    force[0] = d->pattern[0] * of[0][0] + d->pattern[1] * of[0][1];
+    force[1] = d->pattern[0] * of[0][1] + d->pattern[1] * of[1][1];
 }
 
 /* Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro. */
-static real_t level(law_t *law)
+static real_t levelling_force(law_t *law)
 {
     const learning_t *v = &law->learning;
     const real_t moment = v->lever * v->theta[LAW_LOAD] + v->theta[LAW_LOAD + 1];
     const real_t target = (v->contact != 0u) ? real_clip(moment, -LARGEST_MOMENT, LARGEST_MOMENT) : REAL(0.0);
-    law->moment += law->design->levelling * (target - law->moment);
+    law->moment += law->design->levelling_pole * (target - law->moment);
     return law->moment;
 }
 
 /* Start afresh from the prior, with nothing learned: a number got out of hand. */
 static void recover(law_t *law)
 {
-    learning_forget(law);
+    learning_reset_all(law);
     law->moment = REAL(0.0);
     law->slow = REAL(0.0);
     law->power = REAL(0.0);
@@ -271,18 +271,18 @@ static real_t shape_noise(law_t *law, real_t exact, uint32_t channel)
 static void scale_reference(law_t *law, real_t needed)
 {
     const design_t *d = law->design;
-    const uint32_t expired = (law->held == 0u) ? 1u : 0u;
-    law->held -= (expired != 0u) ? 0u : 1u;
+    const uint32_t expired = (law->hold_left == 0u) ? 1u : 0u;
+    law->hold_left -= (expired != 0u) ? 0u : 1u;
     if (needed >= REAL(0.98) * law->peak) {
         law->peak = real_min(real_max(law->peak, needed), MOST_NEEDED);
-        law->held = d->hold;
+        law->hold_left = d->hold;
     } else if (expired != 0u) {
         law->peak *= d->decay;
     } else {
         /* held */
     }
-    law->scale += d->smoothing * (REAL(1.0) / real_max(law->peak, REAL(1.0)) - law->scale);
-    law->smooth_scale += d->smoothing * (law->scale - law->smooth_scale);
+    law->scale += d->scale_pole * (REAL(1.0) / real_max(law->peak, REAL(1.0)) - law->scale);
+    law->smooth_scale += d->scale_pole * (law->scale - law->smooth_scale);
 }
 
 /* Drive of a channel for the forces, rounded and inside the limit; raises `most`, the largest need over the limit. */
@@ -365,7 +365,7 @@ uint32_t law_step(
     nominal_force(law, nominal);
     learning_force(law, learned);
     force[0] += nominal[0] + learned[0];
-    force[1] += nominal[1] + learned[1] + level(law);
+    force[1] += nominal[1] + learned[1] + levelling_force(law);
     play(law, force, nominal, drive);
     learning_advance(law, law->ring[law->at_ring]); /* what was computed LAW_DELAY samples ago acts now */
     law->sample++;

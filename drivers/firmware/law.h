@@ -17,7 +17,7 @@
 #define LAW_FILTER_TAPS 12  /* of the derivatives' filters, 6 of them ahead */
 #define LAW_LOOKAHEAD (LAW_DELAY + LAW_FILTER_TAPS / 2)
 #define LAW_PAST (LAW_DAMPER_TAPS > 16 ? 64 : 16) /* samples of the inner damper, a power of two */
-#define LAW_BASIS 6         /* r, r'/w_n, r''/w_n^2, r through the pair of poles, its derivative/w_p, D_00 r' T */
+#define LAW_BASIS 6         /* beta: r, r'/w_n, r''/w_n^2, r_p (r through the pair of poles), r_p'/w_p, D_00 r' T */
 #define LAW_RING (LAW_BASIS + 2) /* basis and deviation force of a sample, until they act */
 
 /* parameters of the Kalman filter: first of each set, and their number */
@@ -27,7 +27,7 @@
 #define LAW_LOAD 12
 #define LAW_INITIAL 14
 #define LAW_PARAMETERS 18
-#define LAW_ROWS (LAW_PARAMETERS + 1) /* regressors psi_i, and w */
+#define LAW_ROWS (LAW_PARAMETERS + 1) /* regressors psi_i, and dev_u */
 #define LAW_OWN (LAW_LOAD - LAW_HEAVE) /* parameters of the device itself */
 
 /* flags of a sample, as hapticrender.protocols.Flag */
@@ -66,27 +66,27 @@ typedef struct {
     real_t coordinate_from_sensor[2][LAW_SENSORS];
     real_t force_from_drive[2][LAW_CHANNELS]; /* N/A */
     real_t drive_from_force[LAW_CHANNELS][2]; /* A/N */
-    real_t shape[2];        /* pattern of the target over the coordinates */
+    real_t pattern[2];      /* pattern of the target over the coordinates */
     real_t lever_per_metre; /* 1/m: lever arm of a finger at x is this times x */
     /* inner damper */
     real_t taps[2][LAW_DAMPER_TAPS]; /* N/m */
     real_t damper_high;              /* gain while it is open, 1 or 0 */
     real_t release;                  /* fall of the gain a sample */
-    real_t level, high_pass, mean_square; /* m^2 that opens it; poles a sample */
-    uint32_t damper_time;                 /* samples, after a contact */
+    real_t gate_threshold, high_pass_pole, mean_square_pole; /* m^2 that opens it; poles a sample */
+    uint32_t damper_time;            /* samples, after a contact */
     /* reference */
     real_t filters[4][LAW_FILTER_TAPS], sensor_filter[LAW_FILTER_TAPS];
-    real_t pair[2][4];                         /* step of the pair of poles */
-    real_t hertz_scale, pole, pole_damping;    /* w_n (rad/s), w_p (rad/s) and its damping ratio */
+    real_t pole_step[2][4];                    /* step of the pair of poles */
+    real_t omega_n, pole, pole_damping;        /* w_n (rad/s), w_p (rad/s) and its damping ratio */
     real_t fade_step, change_step, confidence_step; /* a sample: of a start, of a change, of a sensor fault */
-    real_t decay, smoothing;                   /* of the reference's scale: factor and pole a sample */
+    real_t decay, scale_pole;                  /* of the reference's scale: factor and pole a sample */
     uint32_t hold;                             /* samples */
     /* learning */
-    uint32_t settling, joining, joined, notice, patience; /* samples */
+    uint32_t learning_delay, relearning_delay, initial_end, report_delay, loss_time; /* samples */
     real_t noise[2], model_error;                         /* m^2, and part of the deviation's power */
-    real_t levelling;                                     /* pole a sample */
-    real_t prior[LAW_PARAMETERS], lost[LAW_PARAMETERS], start[4]; /* lost: of the way from the prior, a reversion */
-    real_t spread[LAW_PARAMETERS][LAW_PARAMETERS];
+    real_t levelling_pole;                                /* a sample */
+    real_t prior[LAW_PARAMETERS], reversion_step[LAW_PARAMETERS], initial_variance[4]; /* means; 1 - a_i */
+    real_t prior_covariance[LAW_PARAMETERS][LAW_PARAMETERS];
 } design_t;
 
 extern const design_t design; /* in design.c */
@@ -139,7 +139,7 @@ typedef struct law {
     real_t peak, scale, smooth_scale;
     real_t shaper[2][LAW_CHANNELS];
     real_t measured_dc;
-    uint32_t held, fast_timer;                /* samples */
+    uint32_t hold_left, fast_timer;           /* samples */
     uint32_t at_delayed, at_ring;             /* places in `delayed` and `ring` */
     uint32_t sample;                          /* modulo 2^32 */
     uint32_t flags;                           /* of this sample */

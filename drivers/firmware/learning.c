@@ -35,7 +35,7 @@ static loaded_t load_device(const learning_t *v, const design_t *d)
 {
     const real_t *theta = v->theta;
     const real_t w = TURN * FINGER_HERTZ;
-    const real_t turn = w / d->hertz_scale;
+    const real_t turn = w / d->omega_n;
     const real_t pole = d->pole;
     const real_t low_re = pole * pole - w * w;
     const real_t low_im = REAL(2.0) * d->pole_damping * pole * w;
@@ -49,7 +49,7 @@ static loaded_t load_device(const learning_t *v, const design_t *d)
     const real_t mass = real_clip(-z_re / (w * w), lightest, REAL(10e-3)) * touched;
     const real_t damping = real_clip(z_im / w, REAL(0.0), REAL(12.0)) * touched;
     const real_t h = v->lever;
-    const real_t per_c = REAL(1.0) / d->hertz_scale;
+    const real_t per_c = REAL(1.0) / d->omega_n;
     const real_t per_m = per_c * per_c;
     loaded_t p;
     p.m00 = corrected(d->mass[0][0], per_m * theta[LAW_HEAVE + 2]) + mass;
@@ -157,7 +157,7 @@ void learning_reset(law_t *law, uint32_t first, uint32_t last)
     for (uint32_t i = first; i < last; i++) {
         v->theta[i] = law->design->prior[i];
         for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
-            const real_t prior = ((j >= first) && (j < last)) ? law->design->spread[i][j] : REAL(0.0);
+            const real_t prior = ((j >= first) && (j < last)) ? law->design->prior_covariance[i][j] : REAL(0.0);
             v->covariance[i][j] = prior;
             v->covariance[j][i] = prior;
         }
@@ -180,14 +180,14 @@ static void note_device(learning_t *v)
 }
 
 /* Start the regressors from rest, with the deviation of now as four more parameters. */
-static void take_motion(law_t *law)
+static void restart_regressors(law_t *law)
 {
     learning_t *v = &law->learning;
     (void)memset(v->states, 0, sizeof(v->states));
     for (uint32_t k = 0u; k < 4u; k++) {
         v->states[k][LAW_INITIAL + k] = REAL(1.0);
         v->theta[LAW_INITIAL + k] = REAL(0.0);
-        v->covariance[LAW_INITIAL + k][LAW_INITIAL + k] = law->design->start[k];
+        v->covariance[LAW_INITIAL + k][LAW_INITIAL + k] = law->design->initial_variance[k];
     }
 }
 
@@ -198,23 +198,23 @@ static void take_motion(law_t *law)
 static void restart(law_t *law)
 {
     learning_t *v = &law->learning;
-    (void)memcpy(v->covariance, law->design->spread, sizeof(v->covariance));
+    (void)memcpy(v->covariance, law->design->prior_covariance, sizeof(v->covariance));
     (void)memcpy(v->earlier[1], v->earlier[0], sizeof(v->earlier[1]));
     for (uint32_t i = 0u; i < LAW_OWN; i++) {
         v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
         (void)memcpy(&v->covariance[LAW_HEAVE + i][LAW_HEAVE], v->earlier[0][i], sizeof(v->earlier[0][i]));
     }
-    take_motion(law);
+    restart_regressors(law);
 }
 
 /* Learn at once whether the finger is still there: all of its estimate becomes uncertain alike; a lift is reported late. */
-void learning_suspect(law_t *law)
+void learning_suspect_lift(law_t *law)
 {
     learning_t *v = &law->learning;
     for (uint32_t i = LAW_LOAD; i < LAW_PARAMETERS; i++) {
         for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
-            v->covariance[i][j] = law->design->spread[i][j];
-            v->covariance[j][i] = law->design->spread[i][j];
+            v->covariance[i][j] = law->design->prior_covariance[i][j];
+            v->covariance[j][i] = law->design->prior_covariance[i][j];
         }
     }
     for (uint32_t i = LAW_FINGER; i < LAW_HEAVE; i++) {
@@ -222,8 +222,8 @@ void learning_suspect(law_t *law)
             v->covariance[i][j] += v->theta[i] * v->theta[j];
         }
     }
-    take_motion(law);
-    v->since = law->design->joining;
+    restart_regressors(law);
+    v->since = law->design->relearning_delay;
 }
 
 /* Reset what belongs to a contact when one begins or ends, and learn afresh; 1 where there is something to learn. */
@@ -237,7 +237,7 @@ uint32_t learning_follow_contact(law_t *law)
     }
     v->since += (v->since < UINT32_MAX) ? 1u : 0u;
     v->away = (touching != 0u) ? 0u : (v->away + ((v->away < UINT32_MAX) ? 1u : 0u));
-    if ((v->contact != 0u) && (v->away < d->patience)) { /* a position that is missing for so short is no lift-off */
+    if ((v->contact != 0u) && (v->away < d->loss_time)) { /* a position that is missing for so short is no lift-off */
         touching = 1u;
     }
     if (touching != v->contact) {
@@ -249,16 +249,16 @@ uint32_t learning_follow_contact(law_t *law)
         if ((law->sample % LEARNING_REFRESH) != 0u) { /* else it is due in this sample anyway */
             learning_discretise(law);
         }
-    } else if ((v->since == d->settling) || (v->since == d->joining)) {
+    } else if ((v->since == d->learning_delay) || (v->since == d->relearning_delay)) {
         restart(law);
-    } else if (v->since == d->joined) {
+    } else if (v->since == d->initial_end) {
         learning_reset(law, LAW_INITIAL, LAW_PARAMETERS);
-    } else if ((v->since > d->joined) && ((law->sample % d->notice) == 0u)) {
+    } else if ((v->since > d->initial_end) && ((law->sample % d->report_delay) == 0u)) {
         note_device(v);
     } else {
         /* nothing has changed */
     }
-    return (v->since >= d->settling) ? 1u : 0u;
+    return (v->since >= d->learning_delay) ? 1u : 0u;
 }
 
 /*
@@ -270,7 +270,8 @@ static uint32_t first_active(const learning_t *v) { return (v->contact != 0u) ? 
 static uint32_t end_active(const law_t *law)
 {
     const uint32_t since = law->learning.since;
-    return ((since >= law->design->settling) && (since < law->design->joined)) ? LAW_PARAMETERS : LAW_INITIAL;
+    const design_t *d = law->design;
+    return ((since >= d->learning_delay) && (since < d->initial_end)) ? LAW_PARAMETERS : LAW_INITIAL;
 }
 
 /* Sum of the products of two rows' entries `first` to `end - 1`. */
@@ -335,7 +336,7 @@ void learning_update(law_t *law, const real_t error[2])
                 gain[1][i] -= share * gain[0][i];
             }
         }
-        v->model_power[c] += d->mean_square * (error[c] * error[c] + explained * explained - v->model_power[c]);
+        v->model_power[c] += d->mean_square_pole * (error[c] * error[c] + explained * explained - v->model_power[c]);
         const real_t scatter = d->noise[c] + d->model_error * v->model_power[c] + dot(gain[c], states, first, end);
         const real_t innovation = error[c] - explained + dot(states, v->theta, first, end);
         precision[c] = REAL(1.0) / scatter;
@@ -346,17 +347,18 @@ void learning_update(law_t *law, const real_t error[2])
     shrink(v, first, end, gain, precision);
 }
 
-/* Let the parameters return to their mean, and their covariance to its prior; by what is lost, as 1 - 1e-8 is 1. */
+/* Move the parameters and their covariance a step back towards the prior; by 1 - a, as 1 - 1e-8 is 1 in float. */
 void learning_revert(law_t *law)
 {
     learning_t *v = &law->learning;
     const design_t *d = law->design;
     const uint32_t end = end_active(law);
     for (uint32_t i = 0u; i < end; i++) {
-        v->theta[i] += d->lost[i] * (d->prior[i] - v->theta[i]);
+        v->theta[i] += d->reversion_step[i] * (d->prior[i] - v->theta[i]);
         for (uint32_t j = i; j < end; j++) {
-            const real_t share = d->lost[i] + d->lost[j] - d->lost[i] * d->lost[j];
-            const real_t found = v->covariance[i][j] + share * (d->spread[i][j] - v->covariance[i][j]);
+            const real_t *step = d->reversion_step;
+            const real_t share = step[i] + step[j] - step[i] * step[j];
+            const real_t found = v->covariance[i][j] + share * (d->prior_covariance[i][j] - v->covariance[i][j]);
             v->covariance[i][j] = found;
             v->covariance[j][i] = found;
         }
@@ -367,7 +369,7 @@ void learning_revert(law_t *law)
 void learning_force(const law_t *law, real_t force[2])
 {
     const learning_t *v = &law->learning;
-    const real_t *shape = law->design->shape;
+    const real_t *pattern = law->design->pattern;
     real_t finger = REAL(0.0);
     real_t heave = v->theta[LAW_HEAVE + 3] * law->basis[5];
     real_t rocking = REAL(0.0);
@@ -378,8 +380,8 @@ void learning_force(const law_t *law, real_t force[2])
         heave += v->theta[LAW_HEAVE + i] * law->basis[i];
         rocking += v->theta[LAW_COUPLING + i] * law->basis[i];
     }
-    finger *= (real_t)v->contact * (shape[0] + v->lever * shape[1]);
-    force[0] = finger + shape[0] * heave;
+    finger *= (real_t)v->contact * (pattern[0] + v->lever * pattern[1]);
+    force[0] = finger + pattern[0] * heave;
     force[1] = v->lever * finger + rocking;
 }
 
@@ -387,9 +389,9 @@ void learning_force(const law_t *law, real_t force[2])
 static void set_inputs(const law_t *law, const real_t acting[LAW_RING], real_t heave[], real_t rocking[])
 {
     const learning_t *v = &law->learning;
-    const real_t *shape = law->design->shape;
+    const real_t *pattern = law->design->pattern;
     const real_t touched = (real_t)v->contact;
-    const real_t along = touched * (shape[0] + v->lever * shape[1]);
+    const real_t along = touched * (pattern[0] + v->lever * pattern[1]);
     for (uint32_t i = 0u; i < LAW_ROWS; i++) {
         heave[i] = REAL(0.0);
         rocking[i] = REAL(0.0);
@@ -399,10 +401,10 @@ static void set_inputs(const law_t *law, const real_t acting[LAW_RING], real_t h
         rocking[LAW_FINGER + i] = along * v->lever * acting[i];
     }
     for (uint32_t i = 0u; i < 3u; i++) {
-        heave[LAW_HEAVE + i] = shape[0] * acting[i];
+        heave[LAW_HEAVE + i] = pattern[0] * acting[i];
         rocking[LAW_COUPLING + i] = acting[i];
     }
-    heave[LAW_HEAVE + 3] = shape[0] * acting[5];
+    heave[LAW_HEAVE + 3] = pattern[0] * acting[5];
     heave[LAW_LOAD] = REAL(1.0);
     rocking[LAW_LOAD] = touched * v->lever;
     rocking[LAW_LOAD + 1] = REAL(1.0);
@@ -427,7 +429,7 @@ void learning_advance(law_t *law, const real_t acting[LAW_RING])
     set_inputs(law, acting, heave, rocking);
     (void)memcpy(step, v->step, sizeof(step));
     for (uint32_t n = first_active(v); n <= end; n++) {
-        const uint32_t i = (n < end) ? n : (uint32_t)LAW_PARAMETERS; /* w comes last */
+        const uint32_t i = (n < end) ? n : (uint32_t)LAW_PARAMETERS; /* dev_u comes last */
         const real_t x[4] = {v->states[0][i], v->states[1][i], v->states[2][i], v->states[3][i]};
         v->states[0][i] = row_times(step[0], x, heave[i], rocking[i]);
         v->states[1][i] = row_times(step[1], x, heave[i], rocking[i]);
@@ -437,7 +439,7 @@ void learning_advance(law_t *law, const real_t acting[LAW_RING])
 }
 
 /* Forget all that was learned, and what was noted. */
-void learning_forget(law_t *law)
+void learning_reset_all(law_t *law)
 {
     learning_t *v = &law->learning;
     learning_reset(law, 0u, LAW_PARAMETERS);
@@ -454,5 +456,5 @@ void learning_forget(law_t *law)
 void learning_init(law_t *law)
 {
     law->learning.since = LONG_AGO;
-    learning_forget(law);
+    learning_reset_all(law);
 }

@@ -157,14 +157,14 @@ int main(void)
 #endif
         const uint32_t taken = measure_count() - start - empty;
         most = (taken > most) ? taken : most;
-        sums[(n < LANDS) ? 0 : ((n < LANDS + design.joined) ? 1 : 2)] += (double)taken;
+        sums[(n < LANDS) ? 0 : ((n < LANDS + design.initial_end) ? 1 : 2)] += (double)taken;
         plate_advance(&plate, 1.0 / (double)design.rate, position, LOAD);
         plate.drive[0] = (double)drive[0];
         plate.drive[LAW_CHANNELS - 1] = (double)drive[LAW_CHANNELS - 1];
     }
     print_number("free", sums[0] / LANDS);
-    print_number("new", sums[1] / design.joined);
-    print_number("touched", sums[2] / (SAMPLES - LANDS - design.joined));
+    print_number("new", sums[1] / design.initial_end);
+    print_number("touched", sums[2] / (SAMPLES - LANDS - design.initial_end));
     print_number("most", (double)most);
     print_number("flags", (double)flags);
     print_number("state", (double)sizeof(law_t));

@@ -317,8 +317,8 @@ class TouchWatch:
         """Set the law back at the first window with two touches, and slow it until there is one."""
         law, kept, end = self._law, self._kept, int(LOAD)
         if two and not before:
-            law["theta"][:end], law["covariance"][:end] = law["prior"][:end], law["spread"][:end]
-            law["covariance"][:, :end] = law["spread"][:, :end]
+            law["theta"][:end], law["covariance"][:end] = law["prior"][:end], law["prior_covariance"][:end]
+            law["covariance"][:, :end] = law["prior_covariance"][:, :end]
             law["theta"][DEVICE], law["covariance"][DEVICE, DEVICE] = kept["theta"], kept["covariance"]
         elif not two:
             self._note_device()

@@ -38,7 +38,7 @@ def reset_finger(controller):
         put(b, "complete", 1.0)
         for i in range(c.p.coordinates):
             x = record(coordinates_of(controller, t), COORDINATE_T, i)
-            command = get(x, "v") + c.p.shape[i] * get(b, "r")
+            command = get(x, "v") + c.p.pattern[i] * get(b, "r")
             put(x, "last", get(x, "e") - get(x, "v"))
             put(x, "filtered", command)
             for h in range(c.history):
@@ -56,7 +56,7 @@ def note_commands(controller):
     for t in range(c.tiles):
         b, motion = record(c.tiles_at, TILE_T, t), pair(zeros(), zeros())
         for i in range(c.p.coordinates):
-            command = get(record(coordinates_of(controller, t), COORDINATE_T, i), "v") + c.p.shape[i] * get(b, "r")
+            command = get(record(coordinates_of(controller, t), COORDINATE_T, i), "v") + c.p.pattern[i] * get(b, "r")
             put(record(c.commands_at, PAIR_T, 3 * (first + t) + i), "z", command)
             motion = motion + (c.law_lever if i > 0 else 1.0) * command
         w = get(b, "omega")
@@ -136,7 +136,7 @@ def adapt_finger(controller, observer, damper):
             x, arm = record(coordinates_of(controller, t), COORDINATE_T, i), c.lever if i > 0 else 1.0
             command = commanded(controller, newer + 3 * t + i, older + 3 * t + i, share)
             command = interpolated(get(x, "filtered"), command, pole)
-            moved = get(x, "e") + p.shape[i] * reference
+            moved = get(x, "e") + p.pattern[i] * reference
             a = moved - command
             slope, motion = rate * (a - get(x, "last")), motion + arm * moved
             mass, damping = p.mass[0, i] + arm * c.finger_mass, p.damping[0, i] + arm * lag

@@ -218,7 +218,7 @@ def device_settings(model: DeviceModel) -> dict[str, Any]:
     """Settings of the methods that invert the device's dynamic stiffness."""
     return {
         **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
-        "shape": np.append(model.pattern, [0.0])[:2],
+        "pattern": np.append(model.pattern, [0.0])[:2],
         "needs_contact": model.finger.needs_contact,
         "least_speed": model.finger.least_speed,
     }

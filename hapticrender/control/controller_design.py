@@ -224,8 +224,8 @@ def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
         "fast_pole": -math.expm1(-2 * math.pi * fast * period),
         "slow_pole": -math.expm1(-2 * math.pi * slow * period),
         # square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)
-        "fast_level": 2 * math.pi * fast * period * (FAST_SIGMAS * noise) ** 2,
-        "slow_level": 2 * math.pi * slow * period * (SLOW_SIGMAS * noise) ** 2,
+        "fast_threshold": 2 * math.pi * fast * period * (FAST_SIGMAS * noise) ** 2,
+        "slow_threshold": 2 * math.pi * slow * period * (SLOW_SIGMAS * noise) ** 2,
         "fast_time": rules.high_time * model.rate,
         "slow_time": rules.medium_time * model.rate,
         "release": period / rules.release,

@@ -33,17 +33,17 @@ from hapticrender.protocols import Array
 
 HIGHEST = 0.2  # of the rate: up to here the derivatives' filters are good to 5e-5
 LOWEST = 1e-3  # Hz: what follows a finger fades out below it, though a resting one may hold its displacement
-SCALE = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that every parameter is in N/m
+OMEGA_N = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that parameters are in N/m
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
-PEOPLE, SEED = 300, 1  # fingers of the prior, and the seed that draws them
+FINGERS, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.03, HEAVE: 0.003, COUPLING: 0.01, LOAD: 0.6}  # 1/sqrt(s), from each parameter on
 FRICTION_REVERSION = 1.0  # 1/sqrt(s), of a finger's own friction, which stands for the load
-SETTLING, RESTART, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning starts, and again; the damper closes
-JOINING = 60e-3  # s: for so long the deviation at the start of learning is a parameter
-PATIENCE = 1e-3  # s: for so long a position may be missing
+LEARNING_DELAY, RELEARNING_DELAY, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning, again; damper closes
+INITIAL_TIME = 60e-3  # s, from the second start of learning on: the deviation at that start is a parameter
+LOSS_TIME = 1e-3  # s without a position, by which a contact is lost
 MODEL_ERROR = 0.1  # of a deviation and of what the drive explains of it: part that no parameter explains
 LEAST_NOISE = 5e-5  # of the sensors' range
-NOTICE = 10e-3  # s: a contact is reported within this
+REPORT_DELAY = 10e-3  # s: a contact is reported within this
 HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
@@ -58,7 +58,7 @@ LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
 def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, ahead: float = 0.5) -> Array:
     """Filters for derivatives of a signal from the `first` on, `ahead` samples from now, shape (count, TAPS).
 
-    Least squares of ``sum_j h_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w ahead T)`` up to `top` (Hz), with a light
+    Least squares of ``sum_j c_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w ahead T)`` up to `top` (Hz), with a light
     penalty on what lies above.  Half a sample ahead is the middle of the hold, which is undone: over sinc(w T/2).
     """
     offsets, frequency = np.arange(TAPS) - (TAPS // 2 - 1), np.linspace(0.0, top, 400)
@@ -85,8 +85,8 @@ def share_driven(model: DeviceModel, frequency: Array) -> Array:
     return np.where(frequency > top, passed / np.maximum(omega, 1.0) ** 2, 1.0)
 
 
-def people() -> tuple[Array, Array]:
-    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of `PEOPLE` fingers (N/m, shape (PEOPLE, f)).
+def sample_fingers() -> tuple[Array, Array]:
+    """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of `FINGERS` fingers (N/m, shape (FINGERS, f)).
 
     Log-uniform: 1-10 g, 0.3-4 N s/m, 60-900 N/m; three in four behind a skin of 0.1-0.5 g, 0.5-12 N s/m and
     400-12000 N/m.
@@ -95,20 +95,20 @@ def people() -> tuple[Array, Array]:
     s = 2j * np.pi * frequency
 
     def drawn(low: float, high: float) -> Array:
-        return np.exp(random.uniform(np.log(low), np.log(high), (PEOPLE, 1)))
+        return np.exp(random.uniform(np.log(low), np.log(high), (FINGERS, 1)))
 
     whole = drawn(1e-3, 1e-2) * s**2 + drawn(0.3, 4.0) * s + drawn(60.0, 900.0)
     mass, skin = drawn(1e-4, 5e-4) * s**2, drawn(0.5, 12.0) * s + drawn(400.0, 12e3)
-    behind = random.uniform(size=(PEOPLE, 1)) < 0.75
+    behind = random.uniform(size=(FINGERS, 1)) < 0.75
     return frequency, np.where(behind, mass + skin * whole / (skin + whole), whole)
 
 
 def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
-    """Mean and covariance of the finger's five parameters over `people`, fitted where the free device moves easily."""
-    frequency, stiffness = people()
+    """Mean and covariance of the finger's five parameters over `sample_fingers`, best where the device is soft."""
+    frequency, stiffness = sample_fingers()
     s = 2j * np.pi * frequency
     low = s**2 + 2 * POLE_DAMPING * POLE * s + POLE**2
-    basis = np.stack([np.ones_like(s), s / SCALE, (s / SCALE) ** 2, POLE**2 / low, POLE * s / low], axis=1)
+    basis = np.stack([np.ones_like(s), s / OMEGA_N, (s / OMEGA_N) ** 2, POLE**2 / low, POLE * s / low], axis=1)
     weight = 1.0 / abs(model.dynamic_stiffness(frequency)[:, 0, 0])
     rows = basis * weight[:, None]
     exact = (stiffness * weight).T
@@ -121,16 +121,16 @@ def finger_prior(model: DeviceModel) -> tuple[Array, Array]:
 def prior(model: DeviceModel) -> tuple[Array, Array]:
     """Mean (PARAMETERS,) and covariance of all parameters: fingers, the device's own errors, and the load."""
     mean, sigma = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
-    k, m = model.stiffness[0, 0], model.mass[0, 0] * SCALE**2
-    c = max(0.3 * model.damping[0, 0], 0.02 * math.sqrt(model.stiffness[0, 0] * model.mass[0, 0])) * SCALE
+    k, m = model.stiffness[0, 0], model.mass[0, 0] * OMEGA_N**2
+    c = max(0.3 * model.damping[0, 0], 0.02 * math.sqrt(model.stiffness[0, 0] * model.mass[0, 0])) * OMEGA_N
     sigma[HEAVE : HEAVE + 4] = 0.05 * k, c, 0.05 * m, 1.0
     sigma[LOAD] = LOAD_SIZE[0]
     if len(model.mass) > 1:
-        k, m, c = model.stiffness[1, 1], model.mass[1, 1] * SCALE**2, c
+        k, m, c = model.stiffness[1, 1], model.mass[1, 1] * OMEGA_N**2, c
         sigma[COUPLING : COUPLING + 3] = 0.03 * k, c, 0.05 * m
         sigma[LOAD + 1] = LOAD_SIZE[1]
     if model.finger.contact is None:  # friction: the device is what is not known, and no finger adds to it
-        sigma[HEAVE : HEAVE + 4] = FRICTION * np.array([k, model.damping[0, 0] * SCALE, m, 1.0])
+        sigma[HEAVE : HEAVE + 4] = FRICTION * np.array([k, model.damping[0, 0] * OMEGA_N, m, 1.0])
         sigma[LOAD] = LOAD_OF_FRICTION
         return mean, np.diag(sigma**2)
     covariance = np.diag(sigma**2)
@@ -227,34 +227,34 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
     """Fields of `INVERSE` that are times, in samples, or poles a sample; `noise` (m rms) opens the damper's gate."""
     period, friction = 1.0 / model.rate, model.finger.contact is None
     return {
-        "settling": round(SETTLING * model.rate),
-        "joining": round(RESTART * model.rate),
-        "joined": round((RESTART + JOINING) * model.rate),
+        "learning_delay": round(LEARNING_DELAY * model.rate),
+        "relearning_delay": round(RELEARNING_DELAY * model.rate),
+        "initial_end": round((RELEARNING_DELAY + INITIAL_TIME) * model.rate),
         "damper_time": round(DAMPER_TIME * model.rate),
-        "patience": round(PATIENCE * model.rate),
+        "loss_time": round(LOSS_TIME * model.rate),
         "model_error": MODEL_ERROR**2,
-        "notice": max(round(NOTICE * model.rate), 1),
-        "level": (GATE_SIGMAS * noise) ** 2,
-        "high_pass": -math.expm1(-2 * math.pi * 20.0 * period),
-        "mean_square": -math.expm1(-period / 4e-3),
+        "report_delay": max(round(REPORT_DELAY * model.rate), 1),
+        "gate_threshold": (GATE_SIGMAS * noise) ** 2,
+        "high_pass_pole": -math.expm1(-2 * math.pi * 20.0 * period),
+        "mean_square_pole": -math.expm1(-period / 4e-3),
         "hold": round(HOLD[friction] * model.rate),
         "decay": math.exp(-period / DECAY[friction]),
-        "smoothing": period / 2e-3,
-        "slowly": period / 1.0,
-        "levelling": period / 50e-3 if len(model.mass) > 1 else 0.0,
+        "scale_pole": period / 2e-3,
+        "power_pole": period / 1.0,
+        "levelling_pole": period / 50e-3 if len(model.mass) > 1 else 0.0,
     }
 
 
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
     """Fields of `INVERSE`."""
     period, n = 1.0 / model.rate, len(model.mass)
-    mean, spread = prior(model)
+    mean, covariance = prior(model)
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1))
     noise = np.resize(noise, 2) * max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
-    kept = np.ones(PARAMETERS)
+    factor = np.ones(PARAMETERS)
     friction = {LOAD: FRICTION_REVERSION} if model.finger.contact is None else {}
     for first, rate in (REVERSION_RATES | friction).items():
-        kept[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
+        factor[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
     matrices = {}
     for name in ("mass", "damping", "stiffness"):
         matrices[name] = np.eye(2)
@@ -272,7 +272,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
         "learns": feedback,
         "lever_per_metre": model.lever_per_metre,
-        "hertz_scale": SCALE,
+        "omega_n": OMEGA_N,
         "pole": POLE,
         "pole_damping": POLE_DAMPING,
         "fade_step": period / FADE_IN,
@@ -280,17 +280,17 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
         "sensor_filter": shown,
         "sensor_rate_filter": rate_shown,
-        "pair": pole_step(model.rate),
+        "pole_step": pole_step(model.rate),
         "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         **matrices,
         "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
         "prior": mean,
-        "spread": spread,
-        "covariance": spread,
-        "earlier": np.vstack([spread[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
+        "prior_covariance": covariance,
+        "covariance": covariance,
+        "earlier": np.vstack([covariance[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,
-        "kept": kept,
-        "start": np.repeat(INITIAL_FRICTION if model.finger.contact is None else INITIAL_MOTION, 2) ** 2,
+        "reversion_factor": factor,
+        "initial_variance": np.repeat(INITIAL_FRICTION if model.finger.contact is None else INITIAL_MOTION, 2) ** 2,
         "scale": 1.0,
         "smooth_scale": 1.0,
         "since": 1e9,

@@ -1,17 +1,17 @@
 """The waveform law's step: exact inverse dynamics of the reference, and a Kalman filter that learns what they lack.
 
-With the reference r = s r(t) (s the pattern over the coordinates) the modelled device takes the force
-F_nom = M r'' + C r' + K r.  The true one moves by r + e (docs/theory.md)::
+With the reference r and its pattern alpha over the coordinates the modelled device takes the force
+F_nom = (M r'' + C r' + K r) alpha.  The true one moves by alpha r + dev (docs/theory.md, "The waveform law")::
 
-    (D + dD + z h h^T) e = F_dev - (dD + z h h^T) r - F_load,       F_dev = F_played - F_nom
+    (D + dD + z h h^T) dev = F_dev - (dD + z h h^T) alpha r - F_load,       F_dev = F_played - F_nom
 
-Everything that is not known is linear in parameters th_i: the finger z on r, r', r'' and on r through one pair of
+Everything that is not known is linear in parameters theta_i: the finger z on r, r', r'' and on r through one pair of
 poles, the device's errors dD of stiffness, damping, mass and delay, and the finger's load.  With G the loaded device,
 
-    e = w - sum_i th_i psi_i + noise,       psi_i = G [s_i phi_i],   w = G [F_dev]
+    dev = dev_u - sum_i theta_i psi_i + noise,       psi_i = G [alpha_i beta_i],   dev_u = G [F_dev]
 
-holds whatever was played, and a Kalman filter finds th; no stability limit follows from how fast it learns.  What it
-finds is played ahead, F = F_nom + sum_i th_i s_i phi_i, with the inner damper on e for a while after a contact.
+holds whatever was played, and a Kalman filter finds theta; no stability limit follows from how fast it learns.  What it
+finds is played ahead, F = F_nom + sum_i theta_i alpha_i beta_i, with the inner damper on dev for a while after contact.
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 
@@ -101,7 +101,7 @@ def take_reference(controller, inverse, waveform):
 def find_basis(controller, inverse):
     """Basis of the forces at the moment at which this sample's drive acts: derivatives of r by the filters."""
     v = record(inverse, INVERSE_T, 0)
-    window, filters, basis, poles, pair = v.window, v.filters, v.basis, v.poles, v.pair
+    window, filters, basis, poles, pair = v.window, v.filters, v.basis, v.poles, v.pole_step
     d0 = d1 = d2 = d3 = 0.0
     for i in range(TAPS):
         d0 += filters[0, i] * window[i]
@@ -114,7 +114,7 @@ def find_basis(controller, inverse):
     first = pair[0, 0] * poles[0] + pair[0, 1] * poles[1] + pair[0, 2] * last + pair[0, 3] * d0
     poles[1] = pair[1, 0] * poles[0] + pair[1, 1] * poles[1] + pair[1, 2] * last + pair[1, 3] * d0
     poles[0] = first
-    w = v.hertz_scale
+    w = v.omega_n
     basis[0], basis[1], basis[2] = d0, d1 / w, d2 / (w * w)
     basis[3], basis[4] = v.pole * v.pole * first, v.pole * poles[1]
     damping = v.damping[0, 0] + contact_damping(controller)
@@ -126,17 +126,17 @@ def find_basis(controller, inverse):
 def open_gate(controller, inverse, deviation):
     """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
 
-    Noise has a mean square of `level`, (2 sigma)^2 as stated, or of four times that of second differences over sqrt 6
-    (mean over 0.3 s), at most 25 times as stated: a damper that a noisier sensor keeps open passes it on.
+    The threshold is (2 sigma)^2 as stated, or four times the mean square of second differences over sqrt 6 (mean over
+    0.3 s), at most 25 times as stated: a damper that a noisier sensor keeps open passes its noise on.
     `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens the gate.
     """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    v.slow += v.high_pass * (deviation - v.slow)
+    v.slow += v.high_pass_pole * (deviation - v.slow)
     above = deviation - v.slow
-    v.power += v.mean_square * (above * above - v.power)
+    v.power += v.mean_square_pole * (above * above - v.power)
     second = deviation - 2.0 * c.past[0, (c.sample - 1) & PAST_MASK] + c.past[0, (c.sample - 2) & PAST_MASK]
-    v.sensed_noise += NOISE_POLE * v.mean_square * (second * second / 6.0 - v.sensed_noise)
-    noise = max(v.level, min(4.0 * v.sensed_noise, MOST_NOISE * v.level))
+    v.sensed_noise += NOISE_POLE * v.mean_square_pole * (second * second / 6.0 - v.sensed_noise)
+    noise = max(v.gate_threshold, min(4.0 * v.sensed_noise, MOST_NOISE * v.gate_threshold))
     large, closed = v.power > noise, c.fast_open == 0.0
     if large:
         c.fast_timer = max(c.fast_timer, 1.0)
@@ -148,7 +148,7 @@ def open_gate(controller, inverse, deviation):
 
 @kernel
 def damp(controller, coordinate, deviation):
-    """Force of the inner damper, F = -sum taps eps[n - j], and `damper_force` before its gain; `past` is a ring."""
+    """Force of the inner damper, F = -sum c_j dev[n - j], and `damper_force` before its gain; `past` is a ring."""
     c = record(controller, CONTROLLER_T, 0)
     now, force = c.sample & PAST_MASK, 0.0
     c.past[coordinate, now] = deviation
@@ -170,26 +170,26 @@ def learned_force(controller, inverse):
     for i in range(3):
         heave += theta[HEAVE + i] * basis[i]
         rocking += theta[COUPLING + i] * basis[i]
-    finger *= v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
-    return finger + c.p.shape[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
+    finger *= v.contact * (c.p.pattern[0] + v.lever * c.p.pattern[1])
+    return finger + c.p.pattern[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
 
 
 @kernel
-def compare(inverse, nominal, learned):
+def update_powers(inverse, nominal, learned):
     """Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it."""
     v = record(inverse, INVERSE_T, 0)
     free = 1.0 - v.contact
-    v.reference_power += v.slowly * (free * v.reference * v.reference - v.reference_power)
-    v.nominal_power += v.slowly * (free * nominal * nominal - v.nominal_power)
-    v.learned_power += v.slowly * (free * learned * learned - v.learned_power)
+    v.reference_power += v.power_pole * (free * v.reference * v.reference - v.reference_power)
+    v.nominal_power += v.power_pole * (free * nominal * nominal - v.nominal_power)
+    v.learned_power += v.power_pole * (free * learned * learned - v.learned_power)
 
 
 @kernel
-def level(inverse):
+def levelling_force(inverse):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
     v = record(inverse, INVERSE_T, 0)
     target = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
-    v.moment += v.levelling * (target - v.moment)
+    v.moment += v.levelling_pole * (target - v.moment)
     return v.moment
 
 
@@ -200,13 +200,13 @@ def scale_reference(inverse, needed):
     The largest need is held for a while and then falls; two poles smooth the scale, so that it makes no edges.
     """
     v = record(inverse, INVERSE_T, 0)
-    v.held -= 1.0
+    v.hold_left -= 1.0
     if needed >= 0.98 * v.peak:
-        v.peak, v.held = min(max(v.peak, needed), MOST_NEEDED), v.hold
-    elif v.held < 0.0:
+        v.peak, v.hold_left = min(max(v.peak, needed), MOST_NEEDED), v.hold
+    elif v.hold_left < 0.0:
         v.peak *= v.decay
-    v.scale += v.smoothing * (1.0 / max(v.peak, 1.0) - v.scale)
-    v.smooth_scale += v.smoothing * (v.scale - v.smooth_scale)
+    v.scale += v.scale_pole * (1.0 / max(v.peak, 1.0) - v.scale)
+    v.smooth_scale += v.scale_pole * (v.scale - v.smooth_scale)
 
 
 @kernel
@@ -281,7 +281,7 @@ def inverse_step(state, signals, start, count):
             c.sample += 1
         learning = follow_contact(state, inverse)
         take_reference(state, inverse, waveform[n] if c.p.analysed > 0.0 else 0.0)
-        error0, error1 = y0 - c.p.shape[0] * v.reference, y1 - c.p.shape[1] * v.reference
+        error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
             reset_parameters(inverse, 0, PARAMETERS)
@@ -290,7 +290,7 @@ def inverse_step(state, signals, start, count):
                 error0, error1 = c.past[0, (c.sample - 1) & PAST_MASK], c.past[1, (c.sample - 1) & PAST_MASK]
             elif (
                 open_gate(state, inverse, error0)
-                and v.since > v.joined
+                and v.since > v.initial_end
                 and v.contact > 0.0
                 and c.p.needs_contact == 0.0
             ):
@@ -305,15 +305,15 @@ def inverse_step(state, signals, start, count):
         if v.sample % REFRESH == 0:
             discretise(state, inverse)
         d1, d2 = find_basis(state, inverse)
-        s0, s1, d0 = c.p.shape[0], c.p.shape[1], v.basis[0]
+        s0, s1, d0 = c.p.pattern[0], c.p.pattern[1], v.basis[0]
         along = v.stiffness[0, 0] * d0 + (v.damping[0, 0] + contact_damping(state)) * d1 + v.mass[0, 0] * d2
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
         learned0, learned1 = learned_force(state, inverse)
-        compare(inverse, nominal0, learned0)
+        update_powers(inverse, nominal0, learned0)
         samples[Y, 0] += nominal0 + learned0
-        samples[Y + 1, 0] += nominal1 + learned1 + level(inverse)
+        samples[Y + 1, 0] += nominal1 + learned1 + levelling_force(inverse)
         play(state, inverse, drive, flags, n, nominal0, nominal1)
         advance_regressors(state, inverse)
         v.sample += 1

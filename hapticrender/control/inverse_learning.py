@@ -1,7 +1,7 @@
 """What the waveform law learns: a Kalman filter for finger, device and load, and the loaded device's model behind it.
 
-Symbols and equations are those of `inverse_kernel`: e = w - sum_i th_i psi_i + noise.  The regressors psi_i and w are
-states of the loaded device G, discretised anew as the estimate moves; what a contact does to them is here, too.
+Symbols and equations are those of `inverse_kernel`: dev = dev_u - sum_i theta_i psi_i + noise.  The regressors psi_i
+and dev_u are states of the loaded device G, discretised anew as the estimate moves; a contact resets them.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def discretise(controller, inverse):
     """
     v = record(inverse, INVERSE_T, 0)
     theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
-    turn, pole = w / v.hertz_scale, v.pole
+    turn, pole = w / v.omega_n, v.pole
     low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
     z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
     z += (theta[3] * pole * pole + complex(0.0, theta[4] * pole * w)) / low
     mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
-    h, per_c, per_m = v.lever, 1.0 / v.hertz_scale, 1.0 / (v.hertz_scale * v.hertz_scale)
+    h, per_c, per_m = v.lever, 1.0 / v.omega_n, 1.0 / (v.omega_n * v.omega_n)
     m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
     m01 = v.mass[0, 1] + coupled(v.mass[1, 1], per_m * theta[COUPLING + 2]) + h * mass
     m11 = v.mass[1, 1] + h * h * mass
@@ -111,12 +111,12 @@ def discretise(controller, inverse):
 def reset_parameters(inverse, first, last):
     """Set parameters back to their prior; nothing else is known of them."""
     v = record(inverse, INVERSE_T, 0)
-    theta, covariance, spread, states = v.theta, v.covariance, v.spread, v.states
+    theta, covariance, prior_covariance, states = v.theta, v.covariance, v.prior_covariance, v.states
     for i in range(first, last):
         theta[i] = v.prior[i]
         for j in range(PARAMETERS):
             inside = first <= j < last
-            covariance[i, j] = spread[i, j] if inside else 0.0
+            covariance[i, j] = prior_covariance[i, j] if inside else 0.0
             covariance[j, i] = covariance[i, j]
         for k in range(4):
             states[k, i] = 0.0
@@ -148,7 +148,7 @@ def restore_device(inverse):
 
 
 @kernel
-def take_motion(inverse):
+def restart_regressors(inverse):
     """Start the regressors from rest, with the deviation of now as four more parameters."""
     v = record(inverse, INVERSE_T, 0)
     theta, covariance, states = v.theta, v.covariance, v.states
@@ -156,7 +156,7 @@ def take_motion(inverse):
         for i in range(ROWS):
             states[k, i] = 0.0
         states[k, INITIAL + k] = 1.0
-        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.start[k]
+        theta[INITIAL + k], covariance[INITIAL + k, INITIAL + k] = 0.0, v.initial_variance[k]
 
 
 @kernel
@@ -173,8 +173,8 @@ def restart(inverse):
         within = i < HEAVE or i >= LOAD
         for j in range(PARAMETERS):
             if within or j < HEAVE or j >= LOAD:
-                covariance[i, j] = v.spread[i, j]
-    take_motion(inverse)
+                covariance[i, j] = v.prior_covariance[i, j]
+    restart_regressors(inverse)
 
 
 @kernel
@@ -187,12 +187,12 @@ def suspect_lift(inverse):
     theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
-            covariance[i, j] = covariance[j, i] = v.spread[i, j]
+            covariance[i, j] = covariance[j, i] = v.prior_covariance[i, j]
     for i in range(FINGER, HEAVE):
         for j in range(FINGER, HEAVE):
             covariance[i, j] += theta[i] * theta[j]
-    take_motion(inverse)
-    v.since = v.joining
+    restart_regressors(inverse)
+    v.since = v.relearning_delay
 
 
 @kernel
@@ -208,7 +208,7 @@ def follow_contact(controller, inverse):
     sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
     touching = 0.0 if sticks else c.finger_seen
     v.away = 0.0 if touching > 0.0 else v.away + 1.0
-    if v.contact > 0.0 and v.away < v.patience:  # a position that is missing for so short is no lift-off
+    if v.contact > 0.0 and v.away < v.loss_time:  # a position that is missing for so short is no lift-off
         touching = 1.0
     if touching != v.contact:
         v.contact, v.since = touching, 0.0
@@ -216,13 +216,13 @@ def follow_contact(controller, inverse):
         reset_parameters(inverse, LOAD, PARAMETERS)
         c.fast_timer = v.damper_time
         discretise(controller, inverse)
-    elif v.since == v.settling or v.since == v.joining:
+    elif v.since == v.learning_delay or v.since == v.relearning_delay:
         restart(inverse)
-    elif v.since == v.joined:
+    elif v.since == v.initial_end:
         reset_parameters(inverse, INITIAL, PARAMETERS)
-    elif v.since > v.joined and v.sample % int(v.notice) == 0:
+    elif v.since > v.initial_end and v.sample % int(v.report_delay) == 0:
         note_device(inverse)
-    return v.since >= v.settling
+    return v.since >= v.learning_delay
 
 
 @kernel
@@ -231,7 +231,8 @@ def learn(inverse, coordinate, error):
     v = record(inverse, INVERSE_T, 0)
     states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
     explained = states[coordinate, PARAMETERS]
-    v.model_power[coordinate] += v.mean_square * (error * error + explained * explained - v.model_power[coordinate])
+    square = error * error + explained * explained
+    v.model_power[coordinate] += v.mean_square_pole * (square - v.model_power[coordinate])
     innovation, scatter = error - explained, v.noise[coordinate] + v.model_error * v.model_power[coordinate]
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
@@ -250,14 +251,14 @@ def learn(inverse, coordinate, error):
 
 @kernel
 def revert(inverse):
-    """Let the parameters return to their mean, and their covariance to its prior."""
+    """Move the parameters and their covariance a step back towards the prior."""
     v = record(inverse, INVERSE_T, 0)
-    kept, theta, covariance, spread = v.kept, v.theta, v.covariance, v.spread
+    factor, theta, covariance, prior_covariance = v.reversion_factor, v.theta, v.covariance, v.prior_covariance
     for i in range(PARAMETERS):
-        theta[i] = v.prior[i] + kept[i] * (theta[i] - v.prior[i])
+        theta[i] = v.prior[i] + factor[i] * (theta[i] - v.prior[i])
         for j in range(PARAMETERS):
-            share = kept[i] * kept[j]
-            covariance[i, j] = share * covariance[i, j] + (1.0 - share) * spread[i, j]
+            share = factor[i] * factor[j]
+            covariance[i, j] = share * covariance[i, j] + (1.0 - share) * prior_covariance[i, j]
 
 
 @kernel
@@ -267,16 +268,16 @@ def advance_regressors(controller, inverse):
     states, moved, inputs, phi = v.states, v.moved, v.inputs, v.step
     ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
     at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago
-    touched, along = v.contact, v.contact * (c.p.shape[0] + v.lever * c.p.shape[1])
+    touched, along = v.contact, v.contact * (c.p.pattern[0] + v.lever * c.p.pattern[1])
     for i in range(ROWS):
         inputs[0, i] = inputs[1, i] = 0.0
     for i in range(5):
         inputs[0, FINGER + i] = along * ring[at, i]
         inputs[1, FINGER + i] = along * v.lever * ring[at, i]
     for i in range(3):
-        inputs[0, HEAVE + i] = c.p.shape[0] * ring[at, i]
+        inputs[0, HEAVE + i] = c.p.pattern[0] * ring[at, i]
         inputs[1, COUPLING + i] = ring[at, i]
-    inputs[0, HEAVE + 3] = c.p.shape[0] * ring[at, 5]
+    inputs[0, HEAVE + 3] = c.p.pattern[0] * ring[at, 5]
     inputs[0, LOAD], inputs[1, LOAD] = 1.0, touched * v.lever
     inputs[1, LOAD + 1] = 1.0
     inputs[0, PARAMETERS], inputs[1, PARAMETERS] = ring[at, BASIS], ring[at, BASIS + 1]

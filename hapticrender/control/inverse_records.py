@@ -8,23 +8,23 @@ import numpy as np
 from hapticrender.control.records import MOST_CHANNELS
 
 TAPS = 12  # of the derivatives' filters, 6 of them ahead
-BASIS = 6  # r, r'/w_n, r''/w_n^2, r through the pair of poles and its derivative/w_p, D_00 r' T
+BASIS = 6  # beta: r, r'/w_n, r''/w_n^2, r_p (r through the pair of poles), r_p'/w_p, D_00 r' T
 FINGER, HEAVE, COUPLING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 18])  # first of each set; their number
-ROWS = int(PARAMETERS) + 1  # regressors psi_i, and w
+ROWS = int(PARAMETERS) + 1  # regressors psi_i, and dev_u
 RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
 # 1/m; w_n, w_p (rad/s) and damping ratio of the finger's poles; steps of the fade
-_LAW = "lever_per_metre hertz_scale pole pole_damping fade_step"
+_LAW = "lever_per_metre omega_n pole pole_damping fade_step"
 # after a contact, in samples: learning begins, begins again, has no initial motion any more, the damper closes;
-# samples between two notes of the device's parameters; for so many a position may be missing
-_CONTACT = "settling joining joined damper_time notice patience"
+# samples within which a contact is reported; without a position, by which it is lost
+_CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
-_POLES = "level high_pass mean_square hold decay smoothing levelling slowly"
+_POLES = "gate_threshold high_pass_pole mean_square_pole hold decay scale_pole levelling_pole power_pole"
 # fade and scale of the reference, the drive's largest need; the finger's lever arm and contact, samples since it
 # changed and since a position was there; the gate's slow part, mean square and noise; r as the sensors
-# show it; levelling force; mean squares on the untouched device, see `compare`; last sane sample of the waveform
+# show it; levelling force; mean squares on the untouched device, see `update_powers`; last sane sample of the waveform
 _STATE = """
-fade peak held scale smooth_scale lever contact since away slow power sensed_noise reference moment
+fade peak hold_left scale smooth_scale lever contact since away slow power sensed_noise reference moment
 nominal_power learned_power reference_power last_waveform
 """
 
@@ -36,15 +36,15 @@ INVERSE = np.dtype(
         ("filters", np.float64, (4, TAPS)),
         ("sensor_filter", np.float64, (TAPS,)),
         ("sensor_rate_filter", np.float64, (TAPS,)),  # of its derivative, where the sensors are ahead of the contact
-        ("pair", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
+        ("pole_step", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
-        ("noise", np.float64, (2,)),  # R of heave and rocking
-        ("model_error", np.float64),  # part of `model_power` in R
-        ("prior", np.float64, (ROWS - 1,)),
-        ("spread", np.float64, (ROWS - 1, ROWS - 1)),  # covariance of the prior
-        ("kept", np.float64, (ROWS - 1,)),  # share of a parameter's distance from its prior after a reversion
-        ("start", np.float64, (4,)),  # variances of the initial motion
+        ("noise", np.float64, (2,)),  # of heave and rocking: first part of sigma_e^2
+        ("model_error", np.float64),  # part of `model_power` in sigma_e^2
+        ("prior", np.float64, (ROWS - 1,)),  # mean
+        ("prior_covariance", np.float64, (ROWS - 1, ROWS - 1)),
+        ("reversion_factor", np.float64, (ROWS - 1,)),  # a_i: share of the distance from the prior that stays
+        ("initial_variance", np.float64, (4,)),  # variances of the initial motion
         # state
         *((name, np.float64) for name in _STATE.split()),
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),

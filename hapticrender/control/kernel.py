@@ -136,11 +136,11 @@ def analyse_block(controller):
 def predict(controller, i):
     """Sums over the bands of a coordinate: what the sensors should show, and the commanded motion."""
     c = record(controller, CONTROLLER_T, 0)
-    shape, shown, command = c.p.shape[i], zeros(), zeros()
+    pattern, shown, command = c.p.pattern[i], zeros(), zeros()
     for t in range(c.tiles):
         b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(controller, t), COORDINATE_T, i)
-        shown = shown + real((shape * get(b, "expected") + get(x, "e")) * get(b, "carrier"))
-        command = command + real((shape * get(b, "r") + get(x, "v")) * get(b, "carrier"))
+        shown = shown + real((pattern * get(b, "expected") + get(x, "e")) * get(b, "carrier"))
+        command = command + real((pattern * get(b, "r") + get(x, "v")) * get(b, "carrier"))
     return total(shown), total(command)
 
 
@@ -148,8 +148,8 @@ def predict(controller, i):
 def innovate_sample(controller):
     """Innovation of a sample, DC estimates of type 2, and the inner damper's force into the row STEP.
 
-    The damper is F = -sum taps eps[n - j], `damper_force` before its gain; `past` is a ring of deviations eps from
-    the command.
+    The damper is F = -sum c_j dev[n - j], `damper_force` before its gain; `past` is a ring of deviations from the
+    command.
     """
     c = record(controller, CONTROLLER_T, 0)
     samples, now, p = samples_of(controller), c.sample & PAST_MASK, c.p
@@ -180,7 +180,7 @@ def innovate_block(controller):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for i in range(p.coordinates):
-            envelope = p.shape[i] * get(b, "expected") + get(
+            envelope = p.pattern[i] * get(b, "expected") + get(
                 record(coordinates_of(controller, t), COORDINATE_T, i), "e"
             )
             put(record(c.work_at, WORK_T, 2 * t + i), "x", envelope * get(b, "carrier"))
@@ -233,16 +233,16 @@ def update_envelopes(controller, integral):
                 fast, slow = get(x, "fast"), get(x, "slow")
                 fast = fast + p.fast_pole * (deviation - fast)
                 slow = slow + p.slow_pole * (fast - slow)
-                over = over + maximum(square(fast) - p.fast_level, 0.0)
-                above = above + maximum(square(slow) - p.slow_level, 0.0)
+                over = over + maximum(square(fast) - p.fast_threshold, 0.0)
+                above = above + maximum(square(slow) - p.slow_threshold, 0.0)
                 put(x, "fast", fast)
                 put(x, "slow", slow)
             e = (1.0 - period * fading) * e + gain * found
             slope = -1.0 * (integral * e + fading * v)
             put(x, "e", e)
             # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
-            put(x, "v", v + period * (slope - back * (v + p.shape[i] * reference)))
-            put(x, "slope", slope + p.shape[i] * rise)
+            put(x, "v", v + period * (slope - back * (v + p.pattern[i] * reference)))
+            put(x, "slope", slope + p.pattern[i] * rise)
     return total(over), total(above)
 
 

@@ -2,7 +2,7 @@
 
     F = rho (D V + D' dV/dt + j dw/dt M V),   rho = e^(j w lead) (w T/2)/sin(w T/2)
 
-with D(s) = M s^2 + C s + K + z(s) h h^T, h = [1, g] the finger's lever arm and z its three numbers and what a band
+with D(s) = M s^2 + C s + K + z(s) h h^T, h = [1, p/a] the finger's lever arms and z its three numbers and what a band
 leaves over.  An error of the law for changes of Omega rad/s is bounded by m Omega^2/|D|.
 """
 
@@ -128,7 +128,8 @@ def apply_law(controller):
             reference, force = get(b, "r") + ahead * get(b, "slope"), pair(zeros(), zeros())
             for j in range(p.coordinates):
                 x, law = record(first, COORDINATE_T, j), record(laws, STIFFNESS_T, 2 * i + j)
-                force = force + get(law, "d") * (get(x, "v") + p.shape[j] * reference) + get(law, "s") * get(x, "slope")
+                command = get(x, "v") + p.pattern[j] * reference
+                force = force + get(law, "d") * command + get(law, "s") * get(x, "slope")
             put(record(first, COORDINATE_T, i), "force", force)
             along = along + force * get(b, "carrier")
         samples[Y + i, 0] = total(real(along)) + samples[STEP + i, 0]

@@ -161,7 +161,7 @@ def complex_loops(controller, t, i, envelope):
     """Update V and dV/dt of a tile in coordinate i; without feedback V is the reference."""
     c = record(controller, CONTROLLER_T, 0)
     b, x, p = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
-    reference, weight = p.shape[i] * get(b, "r"), get(b, "weight")
+    reference, weight = p.pattern[i] * get(b, "r"), get(b, "weight")
     against = 0.0 if p.deviation > 0.0 else 1.0
     out = loop_controller(controller, x, p.feedback * weight * (against * reference - envelope), -math.inf)
     keep = 1.0 - LEAK / p.rate * (1.0 - weight)
@@ -183,7 +183,7 @@ def complex_law(controller):
             b = record(c.tiles_at, TILE_T, t)
             reference = reference + real(get(b, "r") * get(b, "carrier"))
         for i in range(n):
-            samples[Y + i, 0] -= p.shape[i] * total(reference)
+            samples[Y + i, 0] -= p.pattern[i] * total(reference)
     for i in range(n):
         samples[SUM + i, 0] = 0.0
     for t in range(c.tiles):

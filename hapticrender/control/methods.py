@@ -218,7 +218,7 @@ def complex_settings(
     return {
         **low_pass_settings(model, bands, width, model.coordinate_from_sensed, drive_map, feedback),
         **device_settings(model),
-        "shape": (1.0, 0.0),
+        "pattern": (1.0, 0.0),
         "forward": forward,
         "fade_in": 1.0 / (FADE_IN * model.rate) if forward else 1.0,
     }

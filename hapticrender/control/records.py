@@ -86,7 +86,7 @@ rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge
 needs_contact least_speed sensor_delay contact_lag corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high
-detects fast_pole slow_pole fast_level slow_level fast_time slow_time release
+detects fast_pole slow_pole fast_threshold slow_threshold fast_time slow_time release
 contact_on contact_off contact_damping typical_speed lock
 adaptation adaptation_high rest rest_high age least_motion typical_mass typical_stiffness
 least_mass most_mass least_damping most_damping least_stiffness most_stiffness
@@ -96,7 +96,7 @@ SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
-        ("shape", np.float64, (2,)),
+        ("pattern", np.float64, (2,)),
         ("added_damping", np.float64, (2,)),
         ("damper_noise", np.float64, (2,)),  # N rms beyond `RINGING`, of `damper_force` by sensor noise; 0: unknown
         ("taps", np.float64, (2, MOST_TAPS)),
