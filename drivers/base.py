@@ -147,7 +147,7 @@ class BaseDriver(OpenedInWith):
     """A driver whose kinds differ only in how they open, play and close.
 
     A subclass fills in `_play`, and `_open` and `_close` where it has something to acquire.  It is used once: opened,
-    played, closed for good.
+    played, closed and not to be opened again.
 
     Parameters
     ----------

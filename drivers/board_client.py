@@ -35,8 +35,8 @@ FAULTS = {
     Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
     Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
-    Cause.RESCALED: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",
-    Cause.INVERTED: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
+    Cause.SENSOR_GAIN: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",
+    Cause.ACTUATOR_GAIN: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
     Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
 }
 Result = TypeVar("Result")
@@ -188,7 +188,7 @@ class BoardClient(OpenedInWith):
         self._setup = self._setup._replace(limits=limits)
 
     def watch(self, seconds: float | None) -> None:
-        """Let the board stop for good where the application is silent for so long, 0.05 to 65 s; None: never.
+        """Let the board stop permanently where the application is silent for so long, 0.05 to 65 s; None: never.
 
         It has to call `beat`, or `watch` again: the heartbeats of the client's thread do not count.  Never waits.
         """

@@ -114,8 +114,8 @@ class Cause(IntEnum):
     RINGING = 22
     OVERMOTION = 23
     BEYOND = 24
-    RESCALED = 25
-    INVERTED = 26
+    SENSOR_GAIN = 25
+    ACTUATOR_GAIN = 26
     SWAPPED = 27
 
 

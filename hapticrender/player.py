@@ -78,7 +78,7 @@ class Player:
         simulation reproducibly.
     watchdog : float, s, optional
         Where no method of this player is called for so long, the application counts as hung and the drive is stopped
-        for good, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
+        permanently, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
     **tables
         Further fields of the scene, in place of a scene's own: profile, simulation, rendering, method, seed.  No
         touch_panel: that of a scene locates the finger that moves by itself, and positions passed to `finger` are taken

@@ -38,7 +38,7 @@ class Flag(IntFlag):
     OVERRUN = 8  # the driver lost samples
     OPEN_LOOP = 16  # a force could not be sensed and is driven open loop
     UNLOCKED = 32  # a carrier is off its resonance, or the motion is too small to measure it
-    STOPPED = 64  # the drive was stopped for good: by the supervisor, a watchdog, an error or a signal
+    STOPPED = 64  # the drive was stopped permanently: by the supervisor, a watchdog, an error or a signal
     TWO_TOUCHES = 128  # one finger cannot explain what a plate senses; the law learns more slowly
 
 

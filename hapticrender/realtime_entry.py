@@ -236,7 +236,7 @@ class RealtimeEntry(Addressed):
         self._hand_over()
 
     def watch(self, seconds: float | None = None) -> None:
-        """Stop the drive for good once neither this nor `alive` has been called for so long (s); None: never."""
+        """Stop the drive permanently once neither this nor `alive` has been called for so long (s); None: never."""
         self._slot["watchdog"] = 0.0 if seconds is None else seconds * self.rate
         self._count_call()
 

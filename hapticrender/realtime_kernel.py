@@ -250,7 +250,7 @@ def watch(entry, slot):
 
 @kernel
 def stop(entry):
-    """Bring every channel down to zero within `supervisor.FADE_OUT` of a stop, for good; returns the block's flags.
+    """Bring every channel down to zero within `supervisor.FADE_OUT` of a stop, to stay; returns the block's flags.
 
     The supervisor of one part of a device stops the drive of that part alone, and perhaps faster.
     """

@@ -170,7 +170,7 @@ class HybridRenderer(BaseRenderer):
         friction = None
         if setup.friction is not None:
             friction = self._screen.device_model(setup.friction, _part_of(driver, 1, 1, "screen"))
-        if friction is not None and (setup.bands.wavenumber > 0.0).any():  # fixed carriers have their share for good
+        if friction is not None and (setup.bands.wavenumber > 0.0).any():  # fixed carriers keep their share
             start = setup.settings.start
             plate = replace(plate, highest_frequency=start, highest_edge=2.0)
             friction = replace(friction, lowest_frequency=2 * start)

@@ -90,7 +90,7 @@ class Exports:
         self.folder, self.renderings, self.parts, self.libraries = folder, {}, {}, {}
 
     def rendering(self, name):
-        """Scene whose drive is not rounded: a last bit would decide which way, and both would part for good.
+        """Scene whose drive is not rounded: a last bit would decide which way, and both would differ from then on.
 
         Its name is a texture's, or that of a device, which plays tones.
         """

@@ -89,8 +89,8 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
     ("gains", "causes"),
     [
         ("0,1", {Cause.FROZEN, Cause.INCONSISTENT}),
-        ("1,-1", {Cause.RESCALED, Cause.INVERTED}),
-        ("-1,-1", {Cause.RESCALED, Cause.INVERTED}),
+        ("1,-1", {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
+        ("-1,-1", {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
     ],
 )
 def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):

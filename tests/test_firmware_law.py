@@ -116,8 +116,8 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
 @pytest.mark.parametrize(
     ("shown", "moved", "touch", "cause", "named"),
     [
-        (-np.eye(2), np.eye(2), None, causes.RESCALED, "sensor 1 and 2"),
-        (np.eye(2), -np.eye(2), None, causes.INVERTED, "actuator 1 and 2"),
+        (-np.eye(2), np.eye(2), None, causes.SENSOR_GAIN, "sensor 1 and 2"),
+        (np.eye(2), -np.eye(2), None, causes.ACTUATOR_GAIN, "actuator 1 and 2"),
         (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), causes.SWAPPED, "sensor 1 and 2"),
         (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), causes.SWAPPED, "sensor 1 and 2"),
     ],

@@ -38,7 +38,7 @@ def fail_while_recording(player, path):
 
 
 def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
-    """0.3 s after the last call, to a block; within 10 ms; for good, with a flag and an error."""
+    """0.3 s after the last call, to a block; within 10 ms; it stays stopped, with a flag and an error."""
     with hr.Player(paced=False, watchdog=0.3) as player:
         player.play(TONE)
         player.record(tmp_path / "hung.au")

@@ -149,7 +149,7 @@ static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t fo
     }
     s->left -= 1u;
     if (s->left == 0u) {
-        faults->rescaled = judge_gains(s, SENSOR, p->innovation, &faults->swapped);
+        faults->sensors = judge_gains(s, SENSOR, p->innovation, &faults->swapped);
     }
 }
 
@@ -172,7 +172,7 @@ static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t 
         advance_model(models[j], p, own);
     }
     if ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) {
-        faults->inverted = judge_gains(s, ACTUATOR, p->window_pole * p->innovation, &faults->swapped);
+        faults->actuators = judge_gains(s, ACTUATOR, p->window_pole * p->innovation, &faults->swapped);
     }
 }
 

@@ -33,7 +33,7 @@ typedef struct {
 
 /* What has changed: sensors whose gain has, and actuators that are inverted, as bits; whether two are swapped. */
 typedef struct {
-    uint32_t rescaled, inverted, swapped;
+    uint32_t sensors, actuators, swapped;
 } gain_faults_t;
 
 /* Compare a sample's sensors with the motion that device and force (N, N, from this sample on) give. */

@@ -5,7 +5,7 @@
 
 #define ROOT2 REAL(1.4142135623730951)
 #define INVALID_SHARE REAL(0.3)
-#define HELD 5u /* times the longest repetition before: converters may hold their values */
+#define REPEAT_FACTOR 5u /* times the longest repetition before: converters may hold their values */
 #define BY_DRIVE REAL(6.0) /* energy of the residual over that of the force: in a fault the residual is the drive */
 #define POWER REAL(0.6)
 #define SLOW_POWER REAL(0.65)
@@ -41,7 +41,7 @@ static uint32_t is_frozen(supervisor_t *s, uint32_t i, real_t value, real_t driv
     s->repeats[i] += 1u;
     s->least[i] = real_min(s->least[i], drive);
     s->most[i] = real_max(s->most[i], drive);
-    least_time = HELD * (((s->longest[i] > 0u) && (s->longest[i] < most_usual)) ? s->longest[i] : most_usual);
+    least_time = REPEAT_FACTOR * (((s->longest[i] > 0u) && (s->longest[i] < most_usual)) ? s->longest[i] : most_usual);
     least_time = (least_time > most_usual) ? least_time : most_usual;
     return ((s->repeats[i] >= least_time) && (s->most[i] - s->least[i] > s->p->frozen_drive)) ? 1u : 0u;
 }
@@ -110,7 +110,7 @@ static void filter_signals(supervisor_t *s)
         step = p->high * (x - f->high[i]);
         const real_t mean = f->high[i] + step;
         f->high[i] = mean + step;
-        const real_t top = p->shape * (x - mean - f->level[i] - (p->corner + ROOT2) * f->band[i]);
+        const real_t top = p->top_gain * (x - mean - f->level[i] - (p->corner + ROOT2) * f->band[i]);
         const real_t band = f->band[i] + p->corner * top;
         const real_t level = f->level[i] + p->corner * band;
         f->band[i] = band + p->corner * top;
@@ -123,7 +123,7 @@ static void filter_signals(supervisor_t *s)
 
 static void mean(real_t *value, real_t pole, real_t sample) { *value += pole * (sample - *value); }
 
-/* Test 9: whether heave has been driven on by what the model lacks for long, as no finger does. */
+/* Test 4, slowly: whether heave has been driven on by what the model lacks for long, as no finger does. */
 static uint32_t check_growth(supervisor_t *s, real_t residual)
 {
     const supervision_t *p = s->p;
@@ -179,7 +179,7 @@ static void judge_energies(const supervisor_t *s, uint32_t *wrong, uint32_t *act
     }
 }
 
-/* Tests 3, 4, 7 and 9: whether the motion follows from the drive; `danger` is raised where it is large. */
+/* Tests 3, 4 and 7: whether the motion follows from the drive; `danger` is raised where it is large. */
 static supervisor_cause_t check_motion(supervisor_t *s, uint32_t *danger)
 {
     const supervision_t *p = s->p;
@@ -236,7 +236,7 @@ static uint32_t rings(supervisor_t *s, const law_t *law)
     for (uint32_t i = 0u; i < 2u; i++) {
         real_t top = law->damper_force[i];
         for (uint32_t j = i; j < 4u; j += 2u) {
-            top = p->ring_shape * (top - s->filter.ring_level[j] - (g + ROOT2) * s->filter.ring_band[j]);
+            top = p->ring_top_gain * (top - s->filter.ring_level[j] - (g + ROOT2) * s->filter.ring_band[j]);
             const real_t band = s->filter.ring_band[j] + g * top;
             s->filter.ring_band[j] = band + g * top;
             s->filter.ring_level[j] += REAL(2.0) * g * band;
@@ -293,25 +293,25 @@ static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
-/* Tests 10 to 12: whether a sensor or an actuator has changed its gain, or two are swapped. */
+/* Tests 9 to 11: whether a sensor or an actuator has changed its gain, or two are swapped. */
 static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
 {
     gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         if (2u * s->repeats[i] > s->p->frozen_time) { /* that is for test 2 to find */
-            found.rescaled &= ~(1u << i);
+            found.sensors &= ~(1u << i);
             found.swapped = 0u;
         }
     }
-    if ((cause != SUPERVISOR_FINE) || ((found.rescaled | found.swapped | found.inverted) == 0u)) {
+    if ((cause != SUPERVISOR_FINE) || ((found.sensors | found.swapped | found.actuators) == 0u)) {
         return cause;
     }
     if (found.swapped != 0u) {
         s->stopped_sensors = 3u;
         return SUPERVISOR_SWAPPED;
     }
-    s->stopped_sensors = (found.rescaled != 0u) ? found.rescaled : found.inverted;
-    return (found.rescaled != 0u) ? SUPERVISOR_RESCALED : SUPERVISOR_INVERTED;
+    s->stopped_sensors = (found.sensors != 0u) ? found.sensors : found.actuators;
+    return (found.sensors != 0u) ? SUPERVISOR_SENSOR_GAIN : SUPERVISOR_ACTUATOR_GAIN;
 }
 
 /* All tests of a sample; returns what failed first, and whether there is danger. */
@@ -349,7 +349,7 @@ static supervisor_cause_t check(
 
 static void fade_out(supervisor_t *s, supervisor_cause_t cause, uint32_t danger)
 {
-    real_t step = ((danger != 0u) || (s->cause >= SUPERVISOR_RESCALED)) ? s->p->fade_danger : s->p->fade_out;
+    real_t step = ((danger != 0u) || (s->cause >= SUPERVISOR_SENSOR_GAIN)) ? s->p->fade_danger : s->p->fade_out;
     step = (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : step;
     s->fade_step = real_max(s->fade_step, step);
     s->fade = real_max(s->fade - s->fade_step, REAL(0.0));

@@ -22,16 +22,16 @@ typedef enum {
     SUPERVISOR_RINGING,
     SUPERVISOR_OVERMOTION,
     SUPERVISOR_BEYOND,
-    SUPERVISOR_RESCALED,
-    SUPERVISOR_INVERTED,
+    SUPERVISOR_SENSOR_GAIN,
+    SUPERVISOR_ACTUATOR_GAIN,
     SUPERVISOR_SWAPPED
 } supervisor_cause_t;
 
 /* Settings, from `hapticrender export`; poles and fades are per sample, times in samples. */
 typedef struct {
-    real_t invalid_pole, frozen_drive, low, high, corner, shape, omega, energy_pole, power_pole, drive_pole;
-    real_t ring_corner, ring_shape, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive, large_drive;
-    real_t sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_danger, fade_now;
+    real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
+    real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
+    real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_danger, fade_now;
     uint32_t frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time, ring_stop_time;
     uint32_t suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */
@@ -69,14 +69,14 @@ typedef struct {
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
     uint32_t beyond_count, suspended, at, started;
-    uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or rescaled one; actuator */
+    uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or wrong one; actuator */
     supervisor_cause_t cause;
 } supervisor_t;
 
 /* Set a supervisor to rest; the law is set to rest beside it, by law_init. */
 void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *played);
 
-/* Advance the law by a sample, see law_step, and supervise it; a stop is for good. */
+/* Advance the law by a sample, see law_step, and supervise it; a stop is permanent. */
 uint32_t supervisor_step(
     supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference,
     real_t drive[]);

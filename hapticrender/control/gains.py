@@ -260,7 +260,7 @@ def check_gains(gains, sensed, sensors, force0, force1):
     `force0` and `force1` (N) act from this sample on.
     """
     s = record(gains, GAINS_T, 0)
-    rescaled = inverted = 0
+    sensor_faults = actuator_faults = 0
     sensors_swapped = actuators_swapped = False
     if note_innovations(gains, sensed, sensors) and s.left == 0:
         clear_sums(gains, SENSOR)
@@ -268,16 +268,16 @@ def check_gains(gains, sensed, sensors, force0, force1):
         for i in range(6):
             s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
-        rescaled, sensors_swapped = follow_sensors(gains, force0, force1)
+        sensor_faults, sensors_swapped = follow_sensors(gains, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        inverted, actuators_swapped = follow_actuators(gains, force0, force1)
+        actuator_faults, actuators_swapped = follow_actuators(gains, force0, force1)
     elif s.watched > 0:
         clear_sums(gains, ACTUATOR)
         s.watched = 0
     correct_model(gains, STATE, s.e[0], s.e[1])
     advance_model(gains, STATE, force0, force1)
-    return rescaled, inverted, sensors == MOST and (sensors_swapped or actuators_swapped)
+    return sensor_faults, actuator_faults, sensors == MOST and (sensors_swapped or actuators_swapped)
 
 
 @kernel

@@ -17,16 +17,16 @@ from hapticrender.control.gains import GAINS, design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,
+    ACTUATOR_GAIN,
     BEYOND,
     DRIVE,
     FROZEN,
     INCONSISTENT,
     INVALID,
-    INVERTED,
     OVERMOTION,
-    RESCALED,
     RINGING,
     ROOT2,
+    SENSOR_GAIN,
     SUPERVISOR,
     SWAPPED,
     supervised_step,
@@ -60,8 +60,8 @@ class Fault(NamedTuple):
 
     cause: int  # INVALID to SWAPPED
     sample: int  # at which the test failed; the drive fades out from it on
-    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, RESCALED and SWAPPED; actuator of INVERTED
-    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of RESCALED and INVERTED
+    sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, SENSOR_GAIN and SWAPPED; actuator of ACTUATOR_GAIN
+    gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of SENSOR_GAIN and ACTUATOR_GAIN
 
     @property
     def text(self) -> str:
@@ -109,12 +109,12 @@ CAUSES = {
         "sensor {sensor}: more than [limits] displacement",
         "what the scene asks for, how hard the finger presses, and the sensor's offset",
     ),
-    RESCALED: (
+    SENSOR_GAIN: (
         "sensor {sensor}: the samples are suddenly {gain} times the motion; most likely inverted, swapped, "
         "disconnected, or its gain has changed",
         "wiring, polarity and gain of all sensors",
     ),
-    INVERTED: (
+    ACTUATOR_GAIN: (
         "actuator {sensor}: the motion is that of {gain} times its drive; most likely it is inverted, or sensors are",
         "wiring and polarity of all actuators and sensors",
     ),
@@ -129,7 +129,7 @@ class SupervisedController(Addressed):
     """A controller with a compiled step, supervised, behind the `Controller` protocol.
 
     All that is not named here is the controller's own; `fault` says why the drive has been stopped, None while it
-    has not.  A stop is for good: design a new controller to start again.
+    has not.  A stop is permanent: design a new controller to start again.
     """
 
     step = supervised_step
@@ -162,8 +162,8 @@ class SupervisedController(Addressed):
     def fault(self) -> Fault | None:
         """Why and when the drive has been stopped."""
         cause, sample, sensors = (int(self.state[name][0]) for name in ("cause", "stopped", "sensors"))
-        gains = tuple(self.gains["gain"][0, cause - RESCALED].tolist()) if cause in (RESCALED, INVERTED) else ()
-        return Fault(cause, sample, sensors, gains) if cause else None
+        known = self.gains["gain"][0, cause - SENSOR_GAIN].tolist() if cause in (SENSOR_GAIN, ACTUATOR_GAIN) else ()
+        return Fault(cause, sample, sensors, tuple(known)) if cause else None
 
     @property
     def damper_scale(self) -> float:
@@ -269,7 +269,7 @@ def _limit_settings(controller: Any, model: DeviceModel) -> dict[str, Any]:
 
 
 def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[str, Any]:
-    """Settings of tests 3, 4, 7 and 9, which compare motion and drive; `noise` (rms) is that of each sensor."""
+    """Settings of tests 3, 4 and 7, which compare motion and drive; `noise` (rms) is that of each sensor."""
     rate, stiffness = model.rate, float(model.stiffness[0, 0])
     sag, shared = PRESS_LOAD / stiffness, DELAY_ERROR**2
     corner = float(np.clip(1.4 * demand.highest, 250.0, max(rate / 10, 250.0)))
@@ -290,7 +290,7 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "modelled": 1,
         **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
         "corner": g,
-        "shape": 1.0 / (1.0 + g * (g + ROOT2)),
+        "top_gain": 1.0 / (1.0 + g * (g + ROOT2)),
         "omega": omega,
         "low": g / (1.0 + g),
         "high": high / (1.0 + high),
@@ -324,7 +324,7 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
         "controller": state.ctypes.data,
         "ringing": RINGING_VARIANCES * state["p"]["damper_noise"][0] ** 2,
         "ring_corner": g,
-        "ring_shape": 1.0 / (1.0 + g * (g + ROOT2)),
+        "ring_top_gain": 1.0 / (1.0 + g * (g + ROOT2)),
         "ring_pole": _pole(RINGING_MEAN, rate),
         "large_drive": 0.6 * model.drive_limit if needs_all else UNLIMITED,
         **{f"{name}_time": time * rate for name, time in times.items()},

@@ -6,34 +6,33 @@ what the device model lacks: a finger, its load, noise, or a fault (docs/theory.
 one-pole means of squares.
 
 === ============ ================================================================================ ====================
-no  test         condition                                                                        for
+no  cause        condition                                                                        for
 === ============ ================================================================================ ====================
 1   invalid      share of samples that are not finite or not inside the range > 0.3               50 ms (mean)
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves                                         at once
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
+                 or > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s ("slowly")       0.3 s
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
 6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   8 ms
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
-9   active       mean(-r v) > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s          0.3 s
-10  rescaled     a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
+9   sensor gain  a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
                  device and drive give; see `gains`                                               3 ms
-11  inverted     an actuator gives -1.6 to -0.4 times its force; see `gains`                      5 ms and more
-12  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
+10  actuator ... its gain: an actuator gives -1.6 to -0.4 times its force; see `gains`            5 ms and more
+11  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
                  see `gains`                                                                      5 ms and more
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
 static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
-fades out in 10 ms, in danger and after tests 10 to 12 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
+fades out in 10 ms, in danger and after tests 9 to 11 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
 damper is turned down to 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
 
-Tests 3 to 5, 7 and 9 to 12 need a `Demand`, 10 to 12 at most two sensors and actuators; 6 a controller with an inner
-damper; 8 a limit.  Without them a controller has tests 1 and 2.  `limit_rms_drive` holds
-the device's limit of rms drive, where it has one.
-`control.supervisor` designs all of it.
+Tests 3 to 5, 7 and 9 to 11 need a `Demand`, 9 to 11 at most two sensors and actuators; 6 a controller with an inner
+damper; 8 a limit.  Without them a controller has tests 1 and 2.  Causes have these numbers.  `limit_rms_drive` holds
+the device's limit of rms drive, where it has one.  `control.supervisor` designs all of it.
 """
 
 from __future__ import annotations
@@ -49,20 +48,21 @@ from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSO
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag
 
-INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND, RESCALED, INVERTED, SWAPPED = range(1, 12)
+INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND = range(1, 9)
+SENSOR_GAIN, ACTUATOR_GAIN, SWAPPED = range(9, 12)
 EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
-HELD = 5  # times the longest repetition before: converters may hold their values
+REPEAT_FACTOR = 5  # times the longest repetition before: converters may hold their values
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER = 0.6
 SLOW_POWER, SLOW_FORCE = 0.65, 3.0  # healthy: below 0.03, with a finger negative, while it taps up to 0.8 for a moment
 RINGING_STEP = 0.4
 
 _SETTINGS = """
-sensor_limit invalid_pole frozen_drive low high corner shape omega energy_pole power_pole drive_pole
-ring_corner ring_shape ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
+sensor_limit invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole
+ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
 sensed_bound drive_limit heat_pole heat_gain slow_pole
 fade_out fade_danger fade_now
 """.split()
@@ -93,7 +93,7 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
-        ("slow", np.float64, (4,)),  # means of test 9: -r v, and the squares of v, F and r
+        ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
@@ -123,7 +123,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         elif value == last[i] and acts:
             repeats[i] += 1
             least[i], most[i] = min(least[i], drive), max(most[i], drive)
-            usual = HELD * (min(longest[i], p.frozen_time) if longest[i] > 0 else p.frozen_time)
+            usual = REPEAT_FACTOR * (min(longest[i], p.frozen_time) if longest[i] > 0 else p.frozen_time)
             if repeats[i] >= max(p.frozen_time, usual) and most[i] - least[i] > p.frozen_drive:
                 frozen |= 1 << i
         else:
@@ -159,7 +159,7 @@ def filter_signals(supervisor):
         step = p.high * (x - s.high[i])
         mean = s.high[i] + step
         s.high[i] = mean + step
-        top = p.shape * (x - mean - s.level[i] - (g + ROOT2) * s.band[i])
+        top = p.top_gain * (x - mean - s.level[i] - (g + ROOT2) * s.band[i])
         band = s.band[i] + g * top
         level = s.level[i] + g * band
         s.band[i], s.level[i] = band + g * top, level + g * band
@@ -168,7 +168,7 @@ def filter_signals(supervisor):
 
 @kernel
 def check_growth(supervisor, residual):
-    """Test 9: whether heave has been driven on by what the model lacks for long, as no finger does."""
+    """Test 4, slowly: whether heave has been driven on by what the model lacks for long, as no finger does."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, force, rate = s.p, s.value[2], s.rate[0]
     s.slow[0] += p.slow_pole * (-residual * rate - s.slow[0])
@@ -183,7 +183,7 @@ def check_growth(supervisor, residual):
 
 @kernel
 def check_motion(supervisor, drive_in_danger):
-    """Tests 3, 4, 7 and 9: whether the motion follows from the drive; returns the cause and whether there is danger."""
+    """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause and whether there is danger."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, e, value, rate, change = s.p, s.energy, s.value, s.rate, s.change
     last0, last1 = value[2], value[3]
@@ -222,22 +222,22 @@ def check_motion(supervisor, drive_in_danger):
 
 @kernel
 def compare_gains(supervisor):
-    """Tests 10 to 12; returns the cause, and the sensors or actuators, as bits."""
+    """Tests 9 to 11; returns the cause, and the sensors or actuators, as bits."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, q = s.p, s.input
     if s.compared == 0:  # a steady load is no motion
-        held = p.stiffness
-        start_gains(p.gains, q[0], q[1], held[0, 0] * q[0] + held[0, 1] * q[1], held[1, 0] * q[0] + held[1, 1] * q[1])
-    rescaled, inverted, swapped = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+        k = p.stiffness
+        start_gains(p.gains, q[0], q[1], k[0, 0] * q[0] + k[0, 1] * q[1], k[1, 0] * q[0] + k[1, 1] * q[1])
+    sensors, actuators, swapped = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
     for i in range(p.sensors):
         if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
-            rescaled &= ~(1 << i)
+            sensors &= ~(1 << i)
             swapped = False
     if swapped:
         return SWAPPED, EVERY
-    if rescaled > 0:
-        return RESCALED, rescaled
-    return (INVERTED, inverted) if inverted > 0 else (0, 0)
+    if sensors > 0:
+        return SENSOR_GAIN, sensors
+    return (ACTUATOR_GAIN, actuators) if actuators > 0 else (0, 0)
 
 
 @kernel
@@ -266,7 +266,7 @@ def check_ringing(supervisor):
     for i in range(2):
         top = c.damper_force[i]
         for j in (i, 2 + i):
-            top = p.ring_shape * (top - s.ring_level[j] - (g + ROOT2) * s.ring_band[j])
+            top = p.ring_top_gain * (top - s.ring_level[j] - (g + ROOT2) * s.ring_band[j])
             band = s.ring_band[j] + g * top
             s.ring_band[j], s.ring_level[j] = band + g * top, s.ring_level[j] + 2.0 * g * band
         s.ring_energy[i] += p.ring_pole * (top * top - s.ring_energy[i])
@@ -335,7 +335,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     if cause != 0 and s.cause == 0:
         s.cause, s.stopped = cause, s.sample
     if s.cause != 0:
-        quick = danger or s.cause >= RESCALED
+        quick = danger or s.cause >= SENSOR_GAIN
         step = p.fade_now if cause == OVERMOTION else p.fade_danger if quick else p.fade_out
         s.fade_step = max(s.fade_step, step)
         s.fade = max(s.fade - s.fade_step, 0.0)
