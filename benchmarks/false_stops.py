@@ -113,7 +113,7 @@ class Hidden:
 
     def __init__(self, plate):
         self.driver, self.rate = SimulatedDriver(plate), plate.rate
-        self.exchange, self.play = self.driver.exchange, self.driver.play
+        self.device_loop, self.play = self.driver.device_loop, self.driver.play
 
     def __enter__(self):
         self.driver.__enter__()

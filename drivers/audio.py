@@ -21,7 +21,7 @@ from hapticrender.drivers.portaudio import Stream, cards, find
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
 
-PATIENCE = 2.0  # s: longest wait for a block
+TIMEOUT = 2.0  # s: longest wait for a block
 LONGEST = 10.0  # s: delay that no set-up has
 OVERRUN, SATURATED = int(Flag.OVERRUN), int(Flag.SATURATED)
 FAR_AHEAD = 40  # blocks that wait to be played through a cable: nothing is computed from what is sensed
@@ -179,7 +179,7 @@ class AudioDriver(BaseDriver):
 
     def _settle(self) -> None:
         """Wait until the card has called back twice more, or has ended."""
-        enough, end = self._relay.count("calls") + 2, time.monotonic() + PATIENCE
+        enough, end = self._relay.count("calls") + 2, time.monotonic() + TIMEOUT
         while self.active and self._relay.count("calls") < enough and time.monotonic() < end:
             time.sleep(self.block / self.rate)
 
@@ -207,11 +207,11 @@ class AudioDriver(BaseDriver):
 
     def _wait_for(self, number: int) -> None:
         """Wait until the callback has sensed block `number`."""
-        end = time.monotonic() + PATIENCE
+        end = time.monotonic() + TIMEOUT
         while self._queue.blocks <= number:
             self.check()
             if time.monotonic() > end:
-                raise DeviceTimeout(f"{self}: play: no block of {self.block} samples came within {PATIENCE:g} s")
+                raise DeviceTimeout(f"{self}: play: no block of {self.block} samples came within {TIMEOUT:g} s")
             time.sleep(0.2 * self.block / self.rate)
 
     def start(self, entry: Any) -> None:

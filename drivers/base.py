@@ -37,8 +37,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     float: share of its time that a callback takes, 1 is all; NaN where it is not known; shown by ``Player.state()``
 ``loop(rendering)`` (optional)
     of a device with a controller of its own: what it plays live, like ``hapticrender.live_loop.LiveLoop``
-``exchange(controller)`` (optional)
-    a whole closed loop of its own, sample by sample; see ``protocols.Exchange``
+``device_loop(controller)`` (optional)
+    a whole closed loop of its own, sample by sample; see ``protocols.DeviceLoop``
 ``found()`` (optional, class method)
     list of str: the devices that are there now, each as the driver's argument, two spaces, and what it can do; shown
     by ``hapticrender devices``

@@ -49,7 +49,7 @@ class BoardLoop:
         """Return what the board plays of a rendering; a ValueError where it cannot play it."""
         return playable(rendering, self.driver.capabilities)
 
-    def exchange(self, rendering: Rendering, bands: Bands, texture: BoardTexture | None) -> None:
+    def replace(self, rendering: Rendering, bands: Bands, texture: BoardTexture | None) -> None:
         """Change to what was `made` of another rendering of the device: within 20 ms from bands to bands, else 40."""
         self._client.set_bands(bands, texture)
         self.rendering, self._bands, self._texture = rendering, bands, texture

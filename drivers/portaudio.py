@@ -24,8 +24,8 @@ LEAST_VERSION = 0x130600  # 19.6.0: the first whose Pa_GetVersion returns more t
 FLOAT32 = 0x00000001  # paFloat32, interleaved
 ANTICIPATED_ERRORS = {-9985: "it is in use by another program, or does not exist any more"}  # paDeviceUnavailable
 HOST_ERROR = -9999  # paUnanticipatedHostError: PaHostErrorInfo has the details
-PATIENCE = 8.0  # s: longest wait for a stream to close, also on a busy machine
-RESTART = "restart the program"
+CLOSE_TIMEOUT = 8.0  # s: longest wait for a stream to close, also on a busy machine
+ADVICE = "restart the program"
 INSTALL = (
     "to get it: Debian and Ubuntu: apt install libportaudio2; Fedora: dnf install portaudio; "
     'macOS and Windows: pip install "hapticrender[audio]"'
@@ -182,7 +182,7 @@ def initialised() -> Iterator[CDLL]:
 def _initialise(name: str) -> CDLL:
     """Initialise PortAudio; a `DriverError` where it is busy with a stream that did not close: it serves one thread."""
     if LEFT_BEHIND:
-        raise DriverError(f"{name}: initialise: PortAudio has not closed {LEFT_BEHIND[0].name}: {RESTART}")
+        raise DriverError(f"{name}: initialise: PortAudio has not closed {LEFT_BEHIND[0].name}: {ADVICE}")
     portaudio = load()
     with _quiet():
         check(portaudio.Pa_Initialize(), f"{name}: initialise")
@@ -312,11 +312,11 @@ class Stream:
         errors: list[DriverError] = []
         release = threading.Thread(target=self._release, args=(handle, errors), daemon=True)
         release.start()
-        release.join(PATIENCE)
+        release.join(CLOSE_TIMEOUT)
         if release.is_alive():
             LEFT_BEHIND.append(self)
             pythonapi.Py_IncRef(py_object(self))  # it may still be called back while Python ends
-            raise DriverError(f"{self.name}: close: PortAudio did not return within {PATIENCE:g} s: {RESTART}")
+            raise DriverError(f"{self.name}: close: PortAudio did not return within {CLOSE_TIMEOUT:g} s: {ADVICE}")
         if errors:
             raise errors[0]
 

@@ -20,9 +20,9 @@ from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_loop import BoardLoop, playable
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
 from hapticrender.errors import DriverError, HapticError
-from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sensed
+from hapticrender.protocols import Array, Controller, DeviceLoop, Rendering, Sensed
 
-PATIENCE = 0.3  # s that a board has to answer where boards are listed
+LIST_TIMEOUT = 0.3  # s that a board has to answer where boards are listed
 HOST_BLOCK = 100  # samples of drive from the host
 
 
@@ -81,13 +81,13 @@ class SerialDriver(BaseDriver):
     @classmethod
     def _board(cls, port: str) -> str:
         try:
-            board = cls(port, timeout=PATIENCE)
+            board = cls(port, timeout=LIST_TIMEOUT)
         except (OSError, HapticError) as error:
             return f"no board answers ({type(error).__name__})"
         return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
 
-    def exchange(self, controller: Controller) -> Exchange | None:
-        """Return the exchange that runs the board's own loop with the scene's texture; None for a block device.
+    def device_loop(self, controller: Controller) -> DeviceLoop | None:
+        """Return the board's own loop, with the scene's texture; None for a block device.
 
         Raises
         ------
@@ -101,7 +101,7 @@ class SerialDriver(BaseDriver):
         inner: Any = getattr(controller, "controller", controller)
         if self.rendering is None or inner.method != "inverse":
             raise DriverError(
-                f"{self}: exchange: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
+                f"{self}: device_loop: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
         bands, texture = playable(self.rendering, self.capabilities)
         if texture is not None and inner.n_bands:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from hapticrender.drivers.base import BaseDriver
-from hapticrender.protocols import Array, Controller, Exchange, Plant, Sensed
+from hapticrender.protocols import Array, Controller, DeviceLoop, Plant, Sensed
 
 
 class SimulatedDriver(BaseDriver):
     """Plays on a plant model instead of hardware.
 
     Where the plant can run in closed loop with a controller inside compiled
-    code, `exchange` does so; `play` gives the same samples one block at a time.  With `locate`, which makes of the
+    code, `device_loop` does so; `play` gives the same samples one block at a time.  With `locate`, which makes of the
     finger's positions (m, shape (block,)) those that a sensor gives, all goes block by block.
     """
 
@@ -29,8 +29,8 @@ class SimulatedDriver(BaseDriver):
             delay=plant.delay,
         )
 
-    def exchange(self, controller: Controller) -> Exchange | None:
-        """Return the compiled exchange of plant and controller; None where they have to run block by block.
+    def device_loop(self, controller: Controller) -> DeviceLoop | None:
+        """Return the compiled loop of plant and controller; None where they have to run block by block.
 
         A subclass that plays in its own way gets its blocks.
         """

@@ -29,7 +29,7 @@ from numba.extending import intrinsic
 # no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of
 # a part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-PATIENCE = 1.0  # s: a compilation that takes longer is announced
+ANNOUNCED_AFTER = 1.0  # s: a compilation that takes longer is announced
 ANNOUNCED = threading.Event()
 F8, I8, C16 = types.float64, types.int64, types.complex128
 STEP = types.int64(types.int64, types.int64, types.int64, types.int64)
@@ -106,7 +106,7 @@ class CFunction:
 
     @cached_property
     def _compiled(self) -> Any:
-        note = threading.Timer(PATIENCE, announce)
+        note = threading.Timer(ANNOUNCED_AFTER, announce)
         note.daemon = True
         note.start()
         try:

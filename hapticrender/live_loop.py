@@ -162,7 +162,7 @@ class LiveLoop(RealtimeEntry):
         whole = self.whole and self.controller.n_bands == 0
         return self._texture(rendering), self.controller if whole else live_controller(rendering)
 
-    def exchange(self, rendering: Rendering, texture: SampledTexture, controller: Controller) -> None:
+    def replace(self, rendering: Rendering, texture: SampledTexture, controller: Controller) -> None:
         """Fade into the texture of another rendering of the same device; texture and controller are `made` of it.
 
         A controller that takes waveforms goes on; else there is a new one for the texture's bands.

@@ -32,23 +32,23 @@ class LiveThreads:
         thread.start()
         return thread
 
-    def end(self, thread: threading.Thread, device: object, patience: float, busy: Callable[[], str]) -> None:
+    def end(self, thread: threading.Thread, device: object, timeout: float, busy: Callable[[], str]) -> None:
         """Stop all threads and wait for one, which may be in `play` of the device.
 
         Raises
         ------
         HapticError
-            It has not ended within `patience` (s), and is `busy` with what that says.
+            It has not ended within `timeout` (s), and is `busy` with what that says.
         DriverError
-            It has not ended within `patience` (s).
+            It has not ended within `timeout` (s).
         """
         self.stopping.set()
-        thread.join(patience)
+        thread.join(timeout)
         if thread.is_alive():
             if trouble := busy():
                 raise HapticError(trouble)
             self.hanging.set()
-            trouble = f"its driver has not returned for {patience:.3g} s: zero drive could not be played"
+            trouble = f"its driver has not returned for {timeout:.3g} s: zero drive could not be played"
             raise DriverError(f"{device}: {trouble}: switch the device off")
 
 

@@ -28,7 +28,7 @@ from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
-from hapticrender.protocols import Array, Controller, Driver, Exchange, Renderer, Rendering, Sensed
+from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import refuse_to_overwrite
 from hapticrender.touch.scene import Scene
@@ -229,7 +229,7 @@ def _warm_up(rendering: Rendering) -> None:
     Where controller and plant are closed in compiled code nothing is live, and what was compiled would not be used.
     """
     controller = rendering.controller()
-    if _exchange(rendering.driver, controller) is None:
+    if _device_loop(rendering.driver, controller) is None:
         block = rendering.driver.block
         nothing = np.zeros(block)
         controller.run(np.zeros((block, rendering.driver.sensed_channels)), nothing, nothing)
@@ -279,9 +279,9 @@ def zero_drive_after(device: Driver, hangs: Callable[[], bool] = lambda: False) 
     rest()
 
 
-def _exchange(driver: Driver, controller: Controller) -> Exchange | None:
-    """Exchange of a driver that runs this controller itself, sample by sample; None where it takes blocks only."""
-    offered = getattr(driver, "exchange", None)
+def _device_loop(driver: Driver, controller: Controller) -> DeviceLoop | None:
+    """Loop of a driver that runs this controller itself, sample by sample; None where it takes blocks only."""
+    offered = getattr(driver, "device_loop", None)
     return None if offered is None else offered(controller)
 
 
@@ -291,9 +291,9 @@ class _Loop:
     def __init__(self, rendering: Rendering) -> None:
         self.rendering, self.controller = rendering, rendering.controller()
         driver = rendering.driver
-        exchange = _exchange(driver, self.controller)
-        self._exchange = self._block if exchange is None else exchange
-        self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if exchange is not None else 1)
+        loop = _device_loop(driver, self.controller)
+        self._device_loop = self._block if loop is None else loop
+        self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if loop is not None else 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
@@ -306,7 +306,7 @@ class _Loop:
     def advance(self, start: int, count: int) -> dict[str, Any]:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
         self._start = start
-        drive, target, flags, sensed = self._exchange(count, self._reference)
+        drive, target, flags, sensed = self._device_loop(count, self._reference)
         if self._stopped < 0 and (flags & STOPPED).any():
             self._stopped = start + int(np.argmax(flags & STOPPED))
         values, time = sensed.sensed, self._time(len(sensed.sensed))

@@ -55,7 +55,7 @@ UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
-PATIENCE = 5.0  # s without a sample, after which `sleep` gives a device up
+TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
 class Player:
@@ -131,7 +131,7 @@ class Player:
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
         self._stopping = self._threads.stopping
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
-        self._patience = PATIENCE  # s; and two blocks of the driver
+        self._timeout = TIMEOUT  # s; and two blocks of the driver
 
     def __enter__(self) -> Self:
         self._entered = True
@@ -200,7 +200,7 @@ class Player:
             made, *_ = [loop.made(each) for each in renderings]
             with self._lock:
                 self._check()
-                loop.exchange(renderings[0], *made)
+                loop.replace(renderings[0], *made)
                 self._follow(renderings, parts)
 
     def _prepare(self, scene: Scene) -> Rendering:
@@ -219,14 +219,14 @@ class Player:
             self._parts.rotate(-1)
             rendering, seconds = self._parts[0]
             loop = self._playing("play")
-            loop.exchange(rendering, *loop.made(rendering))
+            loop.replace(rendering, *loop.made(rendering))
             self._until += seconds
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
 
         At most 0.15 m, 10 m/s and 20 N.  It goes on at this velocity for 50 ms at most.  Without a velocity, that since
-        the last call is taken.  After 0.25 s without a call what lies along the surface fades out.
+        the last call is taken.  After 0.25 s without a call a function of position fades out.
         """
         self._check()
         now, sane = time.monotonic() if self._paced else self.time, False
@@ -297,10 +297,8 @@ class Player:
                 self._advance(min(end - self.time, SERVICE))
             if self.time > seen:
                 seen, since = self.time, time.monotonic()
-            if time.monotonic() - since > self._patience:
-                raise HapticError(
-                    f"the device has played no sample for {self._patience:.3g} s: check it and its driver"
-                )
+            if time.monotonic() - since > self._timeout:
+                raise HapticError(f"the device has played no sample for {self._timeout:.3g} s: check it and its driver")
             with self._lock:
                 self._check()
 
@@ -360,7 +358,7 @@ class Player:
         calls_back, own = direct and hasattr(device, "start"), direct and hasattr(device, "loop")
         self._clocked = calls_back or own
         blocks = 2 * rendering.driver.block / rendering.driver.rate
-        self._patience = PATIENCE + blocks
+        self._timeout = TIMEOUT + blocks
         if self._watchdog is not None and self._watchdog < blocks:
             raise ValueError(f"watchdog = {self._watchdog:g} s: must be >= {blocks:g} s, two blocks of the driver")
         if self._clocked and not self._paced:
@@ -406,7 +404,7 @@ class Player:
                 if not self._clocked:
                     play_zeros(loop.driver)
 
-        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._patience, busy)
+        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
 
     def _drive_device(self) -> None:
         hold_to_clock(self._playing("play"), self._block, self._stopping)

@@ -90,8 +90,8 @@ class Motion(Protocol):
 class Driver(Protocol):
     """Carries samples to a device, a file or a plant model, and back (see ``hapticrender.drivers.base``).
 
-    A driver may have an `exchange` too: ``exchange(controller)`` returns an `Exchange`, or None where this controller
-    has to be run block by block.
+    A driver may have ``device_loop(controller)`` too, which returns a `DeviceLoop`, or None where this controller has
+    to be run block by block.
     """
 
     rate: float  # Hz
@@ -109,9 +109,9 @@ class Driver(Protocol):
         ...
 
 
-# Advance device and controller together by `count` samples: exchange(count, reference) -> drive as played, target,
+# Advance device and controller together by `count` samples: loop(count, reference) -> drive as played, target,
 # flags, sensed; `reference(position)` gives the texture's waveform at the finger's next positions.
-Exchange = Callable[[int, Callable[[Array], Array]], "tuple[Array, Array, Array, Sensed]"]
+DeviceLoop = Callable[[int, Callable[[Array], Array]], "tuple[Array, Array, Array, Sensed]"]
 
 
 @runtime_checkable

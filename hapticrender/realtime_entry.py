@@ -32,7 +32,7 @@ from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
 from hapticrender.sampled_texture import FADE, SampledTexture
 
-TOUCH_FADE = 0.02  # s: of what lies along the surface, at touch and lift
+TOUCH_FADE = 0.02  # s: of a function of position, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
 GAIN_TIME = 10e-3  # s
 CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers

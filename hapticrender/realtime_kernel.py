@@ -14,10 +14,10 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
 from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
-from hapticrender.sampled_texture import TEXTURE_T, along_surface, eased, in_time
+from hapticrender.sampled_texture import TEXTURE_T, along_surface, in_time, smoothstep
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
-HOLD = 0.25  # s: and after so long what lies along the surface fades out
+HOLD = 0.25  # s: and after so long a function of position fades out
 JUMP = 2e-3  # m: a larger correction of the position is a leap
 CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
 OVERRUN, STOPPED = int(Flag.OVERRUN), int(Flag.STOPPED)
@@ -100,8 +100,8 @@ def shares(entry, sample):
     e = record(entry, ENTRY_T, 0)
     since = sample - e.switch
     if e.changes > 0:
-        return 1.0 - eased(since / e.fade_out), eased((since - e.fade_out) / e.fade_in)
-    return 1.0 - eased(since / e.fade), eased(since / e.fade)
+        return 1.0 - smoothstep(since / e.fade_out), smoothstep((since - e.fade_out) / e.fade_in)
+    return 1.0 - smoothstep(since / e.fade), smoothstep(since / e.fade)
 
 
 @kernel
@@ -208,7 +208,7 @@ def play_texture(entry, slot):
     for m in range(e.block):
         now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
         e.gain += e.gain_pole * (s.gain - e.gain)
-        gain, touch = e.gain, eased(e.touch)
+        gain, touch = e.gain, smoothstep(e.touch)
         before, present = shares(entry, now)
         of_bands = gain * (before + present)
         waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if analysed else of_bands

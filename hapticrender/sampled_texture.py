@@ -33,7 +33,7 @@ TEXTURE_T = numba.from_dtype(TEXTURE)
 
 
 @kernel
-def eased(x):
+def smoothstep(x):
     """Third-order step from 0 to 1 over 0..1."""
     x = min(max(x, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)
@@ -41,17 +41,17 @@ def eased(x):
 
 @kernel
 def in_time(texture, sample):
-    """What lies in time, at a sample of the device's clock; fades out where nothing has been written yet."""
+    """Its function of time, at a sample of the device's clock; fades out where nothing has been written yet."""
     v = record(texture, TEXTURE_T, 0)
     k = sample - v.begun
     if v.length == 0 or k < 0 or k >= v.written:
         return 0.0
-    return eased((v.written - k) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
+    return smoothstep((v.written - k) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
 
 
 @kernel
 def along_surface(texture, position):
-    """What lies along the surface, at a position (m): cubic interpolation; the ends of the profile go on."""
+    """Its function of position, at a position (m): cubic interpolation; the ends of the profile go on."""
     v = record(texture, TEXTURE_T, 0)
     if v.points == 0 or not abs(position) < 1e3:
         return 0.0

@@ -16,7 +16,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_channels, check_tables, read_devices
-from hapticrender.renderers.friction import ROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
+from hapticrender.renderers.friction import HEADROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene
 
@@ -32,7 +32,7 @@ class ElectroadhesionSettings(FrictionSettings):
     its frequency).
     """
 
-    headroom: float = parameter(ROOM, least=1.0, most=100.0)  # swing of the drive over what a nominal finger needs
+    headroom: float = parameter(HEADROOM, least=1.0, most=100.0)  # swing of the drive over what a nominal finger needs
     floor: float = parameter(0.05, most=0.5)  # least attraction over the bias; rounds off the cusps of the square root
     output: str = option("envelope", "envelope", "carrier")
 

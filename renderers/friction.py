@@ -25,7 +25,7 @@ from hapticrender.touch.scene import Scene
 
 RATIO = "render.velocity_per_force"
 LEAST_FORCE = 1e-3  # N: a smaller friction is too small to estimate the contact from
-ROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
+HEADROOM = 2.0  # of the drive that the free device needs: half is left to the feedback
 PLACES = ("friction",)
 
 

@@ -70,15 +70,15 @@ class UltrasonicRenderer(FrictionRenderer):
         assumed, load = setup.assumed, setup.load
         model = _model(setup, driver)
         whole = assumed.friction_coefficient * load
-        room = whole * min(1.0 - assumed.bias, assumed.bias - assumed.friction_law.floor)
+        headroom = whole * min(1.0 - assumed.bias, assumed.bias - assumed.friction_law.floor)
         need = setup.needed(model).drive
-        if need > room:
-            bound = f"must be <= {room:.3g} N, around {assumed.bias:g} of the friction of a finger of {load:.3g} N"
+        if need > headroom:
+            bound = f"must be <= {headroom:.3g} N, around {assumed.bias:g} of the friction of a finger of {load:.3g} N"
             raise ValueError(f"texture.amplitude asks for {need:.3g} N of friction: {bound}")
         if driver.sensed_channels and assumed.sensor == "tribometer":
             setup.check_range(model, assumed.friction_coefficient * setup.largest_load)
         _check_amplitude(assumed, need / whole, load, setup.speed)
-        return replace(model, drive_limit=room)
+        return replace(model, drive_limit=headroom)
 
     def bands(self, setup: SurfaceSetup, model: DeviceModel) -> Bands:
         """Carriers and targets of a scene, refused where the amplitude could not follow."""

@@ -9,7 +9,7 @@ import numpy as np
 
 SATURATED, NONFINITE, SENSOR_CLIPPED = 1, 2, 4
 TURN, TRACKER = 2 * np.pi, 2 * np.pi * 60.0  # rad/s: triple pole of the finger's tracker
-FAR, FASTEST, FRESH, FADE_OUT, FORGET = 1e3, 10.0, 0.03, 0.02, 50.0  # m, m/s, s, s, 1/s
+FAR, FASTEST, FRESH, FADE_OUT, LEAK = 1e3, 10.0, 0.03, 0.02, 50.0  # m, m/s, s, s, 1/s
 STEP = 8  # samples of a step of adaptation
 
 
@@ -63,9 +63,9 @@ class NaiveError:
         self.samples += 1
         quick = p["needs_contact"] and (not self.seen or self.fresh > 0)
         idle = quick or (p["needs_contact"] and self.speed < p["least_speed"])
-        calm = min(abs(self.velocity) / p["crowd_speed"], 1.0) if p["crowd_speed"] > 0 else 1.0
-        g = 0.0 if idle else calm * between(p["observer"], p["observer_high"], self.open[0])
-        self.references(carrier, waveform if sane else 0.0, calm)
+        crowded_gain = min(abs(self.velocity) / p["crowd_speed"], 1.0) if p["crowd_speed"] > 0 else 1.0
+        g = 0.0 if idle else crowded_gain * between(p["observer"], p["observer_high"], self.open[0])
+        self.references(carrier, waveform if sane else 0.0, crowded_gain)
         turn = self.samples % STEP == 0
         self.detect_contact(turn)
         inner = between(p["damper"], p["damper_high"], self.open[0]) if self.scale == 1 else 0.0
@@ -83,9 +83,9 @@ class NaiveError:
 
         shown = e[:, None] * carrier.conj()
         trips = self.detect(self.E - self.v + 2 * shown)
-        forget = FORGET * (1 - self.share)
-        self.E = (1 - T * forget) * self.E + g * self.share * shown
-        dv = -ki * self.E - forget * self.v
+        fading = LEAK * (1 - self.share)
+        self.E = (1 - T * fading) * self.E + g * self.share * shown
+        dv = -ki * self.E - fading * self.v
         back = p["back_calculation"] * (1 - self.scale)
         self.v = self.v + T * (dv - back * (self.v + self.shape * self.R))
         dV = dv + self.shape * self.dR
@@ -144,14 +144,14 @@ class NaiveError:
             self.shown = np.exp(-1j * p["sensor_delay"] * self.w) * (1 + 1j * lag * self.w)
         return carrier
 
-    def references(self, carrier, waveform, calm):
+    def references(self, carrier, waveform, crowded_gain):
         """Target, reference R and its slope."""
         p, before = self.p, self.R
         turn = 1j * self.w if p["differentiated"] else 1.0
         if p["analysed"]:
             e = waveform - (self.raw * carrier).real.sum()
-            self.raw = self.raw + calm * p["waveform_gain"] * e * carrier.conj()
-            follow = min(calm * p["waveform_gain"] / 2, 1.0)
+            self.raw = self.raw + crowded_gain * p["waveform_gain"] * e * carrier.conj()
+            follow = min(crowded_gain * p["waveform_gain"] / 2, 1.0)
             self.target = self.target + follow * (self.weight * turn * self.raw - self.target)
         else:
             self.target = turn * self.weight * self.set * (waveform if p["modulated"] else 1.0)

@@ -6,7 +6,7 @@ conjugated at the reversal.
 """
 
 import numpy as np
-from naive_error import FADE_OUT, FORGET, TURN, NaiveError
+from naive_error import FADE_OUT, LEAK, TURN, NaiveError
 
 
 def section(coefficients, states, x, y=None):
@@ -27,7 +27,7 @@ class NaiveLowPass(NaiveError):
         self.amplitude, self.angle = np.zeros((2, n, k)), np.zeros((2, n, k))
         self.window, self.V = np.zeros((int(p["window"]), n, k), complex), np.zeros((n, k), complex)
         self.fade = (self.wavenumber == 0.0) * 1.0 if p["polar"] else np.zeros(k)
-        self.sign, self.heading, self.table_speed = np.ones(k), np.ones(k, complex), 0.0
+        self.sign, self.r_phasor, self.table_speed = np.ones(k), np.ones(k, complex), 0.0
 
     def step(self, sensed, position, waveform):
         """Return the drive, shape (channels,), and the targets, shape (bands,)."""
@@ -63,24 +63,24 @@ class NaiveLowPass(NaiveError):
         sign = np.where(omega == 0.0, self.sign, np.sign(omega))
         self.low[:, :, sign != self.sign] = self.low[:, :, sign != self.sign].conj()
         self.sign = sign
-        amount = abs(r)
-        sounds = amount > 1e-12
-        self.heading = np.where(sounds, r / np.where(sounds, amount, 1.0), self.heading)
-        carrier, heading = (np.where(sign < 0, z.conj(), z) for z in (carrier, self.heading))
+        r_magnitude = abs(r)
+        r_nonzero = r_magnitude > 1e-12
+        self.r_phasor = np.where(r_nonzero, r / np.where(r_nonzero, r_magnitude, 1.0), self.r_phasor)
+        carrier, r_phasor = (np.where(sign < 0, z.conj(), z) for z in (carrier, self.r_phasor))
         n, at = len(y), abs(self.frequency + self.wavenumber * self.table_speed) / self.p["table_step"]
         gain, lag = (
             np.array([np.interp(at, np.arange(row.size), row) for row in rows]) for rows in np.split(self.table, 2)
         )
         if not self.p["feedback"]:
-            amplitude, theta = np.broadcast_to(amount, (n, amount.size)), self.p["lead"] * abs(omega) - lag
+            amplitude, theta = np.broadcast_to(r_magnitude, (n, r_magnitude.size)), self.p["lead"] * abs(omega) - lag
         else:
             x = self.estimate(y, carrier)
-            off = self.cut(x) - self.cut(heading) if self.p["subtracted"] else self.cut(x * heading.conj())
-            theta = -section(self.p["loop"], self.angle, off * sounds)
-            free = self.p["loop"][0] * (amount - abs(x)) + self.amplitude[0]
+            off = self.cut(x) - self.cut(r_phasor) if self.p["subtracted"] else self.cut(x * r_phasor.conj())
+            theta = -section(self.p["loop"], self.angle, off * r_nonzero)
+            free = self.p["loop"][0] * (r_magnitude - abs(x)) + self.amplitude[0]
             amplitude = np.maximum(free, 0.0) if self.p["clamped"] else free
-            section(self.p["loop"], self.amplitude, amount - abs(x), amplitude)
-        return (amplitude / gain * (heading * carrier * np.exp(1j * theta)).real).sum(axis=1)
+            section(self.p["loop"], self.amplitude, r_magnitude - abs(x), amplitude)
+        return (amplitude / gain * (r_phasor * carrier * np.exp(1j * theta)).real).sum(axis=1)
 
     @staticmethod
     def cut(x):
@@ -98,7 +98,7 @@ class NaiveLowPass(NaiveError):
         if p["feedback"]:
             x = self.estimate(y, carrier)
             v = section(p["loop"], self.integral, weight * (-x if p["deviation"] else wanted - x))
-            self.integral *= 1 - FORGET * (1 - weight) / p["rate"]
+            self.integral *= 1 - LEAK * (1 - weight) / p["rate"]
         v = v + p["forward"] * wanted
         slope, self.V, sweep = (v - self.V) / self.T, v, self.sweep
         force = np.einsum("ijk,jk->ik", stiffness - omega**2 * mass + 1j * omega * damping, v)

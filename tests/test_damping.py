@@ -15,7 +15,7 @@ from hapticrender.control.damping import (
     damping_taps,
     oscillators,
 )
-from hapticrender.control.linear import ErrorLoop, Sampled
+from hapticrender.control.linear import DiscretePlant, ErrorLoop
 from hapticrender.plants.plate import PlateParameters
 
 PLATE = PlateParameters()
@@ -60,7 +60,7 @@ def heave_plant(rate, mode=None):
     if mode is not None:
         omega, mass = 2 * np.pi * mode.frequency, 1.0 / mode.coupling[0]
         both = np.vstack([both, [mass, 2 * mode.damping * omega * mass, omega**2 * mass]])
-    free = Sampled.free(*(np.diag(column) for column in both.T), float(rate))
+    free = DiscretePlant.free(*(np.diag(column) for column in both.T), float(rate))
     return replace(free, b=free.b.sum(axis=1, keepdims=True), c=free.c.sum(axis=0, keepdims=True))
 
 

@@ -148,7 +148,7 @@ def test_serial_ports_are_shown_with_the_boards_that_answer(tmp_path, monkeypatc
     """A compiled board at one port, nothing at the other."""
     with slow_board(tmp_path) as board:
         monkeypatch.setattr(list_ports, "comports", lambda: [ListPortInfo("COM1"), ListPortInfo(str(board.port))])
-        monkeypatch.setattr("hapticrender.drivers.serial.PATIENCE", 10.0)
+        monkeypatch.setattr("hapticrender.drivers.serial.LIST_TIMEOUT", 10.0)
         assert SerialDriver.found() == [
             "COM1  n/a; no board answers (DeviceNotFound)",
             f"{board.port}  n/a; a board of 5000 Hz, 2 out, 2 in",

@@ -21,11 +21,11 @@ from hapticrender.jit import close_loop, digest
 
 ROOT = Path(__file__).resolve().parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-ROOMS = ("hapticrender", "renderers", "drivers")
+FOLDERS = ("hapticrender", "renderers", "drivers")
 
 
 def shipped_files():
-    return sorted(path for room in ROOMS for path in (ROOT / room).rglob("*.py"))
+    return sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
 
 
 def module_name(path):
@@ -48,7 +48,7 @@ def test_packages_on_disk_are_the_packages_shipped():
 
 def test_every_package_comes_from_where_the_map_says():
     beside = PROJECT["tool"]["setuptools"]["package-dir"]
-    assert beside == {f"hapticrender.{room}": room for room in ROOMS[1:]}
+    assert beside == {f"hapticrender.{folder}": folder for folder in FOLDERS[1:]}
     for name, path in MODULES.items():
         assert Path(importlib.import_module(name).__file__).resolve() == path
 
@@ -63,9 +63,9 @@ def test_entry_points_resolve():
 
 
 def test_the_package_shows_its_public_names_and_nothing_else():
-    rooms = {name.split(".")[1] for name in MODULES if "." in name}
+    packages = {name.split(".")[1] for name in MODULES if "." in name}
     public = {name for name in dir(hapticrender) if not name.startswith("_")}
-    assert set(hapticrender.__all__) <= public <= set(hapticrender.__all__) | rooms
+    assert set(hapticrender.__all__) <= public <= set(hapticrender.__all__) | packages
     assert not [name for name in ("Any", "TYPE_CHECKING", "annotations") if hasattr(hapticrender, name)]
 
 
@@ -101,7 +101,7 @@ RESULTS = {"recordings", "report"}
 TOP = {f"hapticrender.{name}" for name in ("cli", "verbs", "validate")}
 
 
-def room_of(name):
+def layer_of(name):
     parts = name.split(".")
     if name in GROUND:
         return "ground"
@@ -122,10 +122,10 @@ def imports(node, at_once=False):
         if is_for_types_only(child) or (at_once and isinstance(child, ast.FunctionDef)):
             continue
         if isinstance(child, ast.Import):
-            yield from (alias.name for alias in child.names if alias.name.split(".")[0] in ROOMS)
+            yield from (alias.name for alias in child.names if alias.name.split(".")[0] in FOLDERS)
         elif isinstance(child, ast.ImportFrom):
             assert not child.level, "an import relative to its package"
-            if child.module.split(".")[0] in ROOMS:
+            if child.module.split(".")[0] in FOLDERS:
                 names = (f"{child.module}.{alias.name}" for alias in child.names)
                 yield from (name if name in MODULES else child.module for name in names)
         else:
@@ -134,10 +134,10 @@ def imports(node, at_once=False):
 
 @pytest.mark.parametrize("name", sorted(set(MODULES) - {"hapticrender"}))
 def test_imports_run_downwards(name):
-    room = room_of(name)
+    layer = layer_of(name)
     for found in imports(tree_of(MODULES[name])):
         assert found.startswith("hapticrender"), f"{name} imports {found} by its short name: a second module object"
-        assert room_of(found) in MAY_IMPORT[room] | {room, "ground"}, f"{name} ({room}) imports {found}"
+        assert layer_of(found) in MAY_IMPORT[layer] | {layer, "ground"}, f"{name} ({layer}) imports {found}"
 
 
 def test_imports_have_no_circles():

@@ -12,7 +12,7 @@ from synthetic import RATE, make_bands, make_play, make_recorder, make_recording
 import hapticrender as hr
 from hapticrender.loop import recorder_of
 from hapticrender.protocols import Flag
-from hapticrender.recordings import envelopes, judge, verdict
+from hapticrender.recordings import envelopes, judge, waveform_figures
 
 EXACT = 1e-9  # relative: the ridge of 1e-12 times the inverse of the worst inflation, with digits to spare
 UM = 1e-6
@@ -378,7 +378,7 @@ def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, flag, foun
 def test_pieces_of_any_size_give_the_same_figures(rng, monkeypatch):
     noise = white(20, 400, rng)
     expected = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]
-    monkeypatch.setattr(verdict, "READ_AT_ONCE", 3000)
+    monkeypatch.setattr(waveform_figures, "READ_AT_ONCE", 3000)
     found = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]
     assert found["window_error"] == pytest.approx(expected["window_error"], rel=1e-4)
 

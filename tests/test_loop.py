@@ -25,7 +25,7 @@ COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "fl
 class Blocks(SimulatedDriver):
     """A driver that is handed blocks alone, and keeps them."""
 
-    exchange, probe = None, False
+    device_loop, probe = None, False
 
     def __init__(self, plant):
         super().__init__(plant)

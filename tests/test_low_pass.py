@@ -119,12 +119,12 @@ def test_silence_keeps_the_phase_and_a_new_target_is_taken_up():
     controller.run(*nothing)
     controller.setpoints[:] = setpoint_rows(dataclasses.replace(bands, envelope=np.array([1e-13 + 0j])))
     controller.run(*nothing)
-    assert controller.field("heading_re")[0] == pytest.approx(1.0, abs=1e-12)
-    assert controller.field("sounds")[0] == 0.0
+    assert controller.field("r_phasor_re")[0] == pytest.approx(1.0, abs=1e-12)
+    assert controller.field("r_nonzero")[0] == 0.0
     controller.setpoints[:] = setpoint_rows(dataclasses.replace(bands, envelope=np.array([2e-6j])))
     _, target, _ = controller.run(*nothing)
     assert target[-1, 0] == 2e-6j
-    assert controller.field("heading_im")[0] == pytest.approx(1.0, abs=1e-12)
+    assert controller.field("r_phasor_im")[0] == pytest.approx(1.0, abs=1e-12)
 
 
 def test_the_table_is_the_free_device_behind_its_hold():

@@ -347,7 +347,7 @@ def test_a_playlist_that_cannot_be_played_leaves_what_plays_and_a_device_that_ca
 
 @dataclass(frozen=True)
 class Own:
-    """A texture of one's own that does not say whether it lies along the surface."""
+    """A texture of one's own that does not say whether it is a function of position."""
 
     along: float = 0.0  # turns a metre
     in_time: float = 0.0  # Hz

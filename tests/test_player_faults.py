@@ -127,7 +127,7 @@ def test_a_driver_that_fails_is_left_at_zero_drive_at_once():
 
 def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch):
     """Zero drive cannot be played through it: the user is told; a driver that returns is closed without a word."""
-    monkeypatch.setattr(hapticrender.player, "PATIENCE", 0.5)
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
     stuck = threading.Event()
 
     class Hanging(Lying):
@@ -182,7 +182,7 @@ class Slow:
 @pytest.mark.parametrize(("share", "hangs"), [(0.3, False), (4.0, False), (0.0, True)])
 def test_a_texture_that_is_slower_than_the_clock_is_named_and_the_device_closed(share, hangs, monkeypatch):
     """Whether it is slow or hangs in the end, the driver plays every block; one that takes 0.3 s a second is well."""
-    monkeypatch.setattr(hapticrender.player, "PATIENCE", 0.5)
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
     ready, closed = threading.Event(), []
 
     class Closing(Lying):

@@ -55,7 +55,7 @@ def test_a_grating_on_the_board_is_as_good_as_on_the_simulated_device(tmp_path, 
 
 def test_a_scene_that_no_board_can_play_is_refused(stepped):
     driver = stepped.driver()
-    with pytest.raises(DriverError, match="exchange: method 'h2' of this scene cannot run on a board"):
+    with pytest.raises(DriverError, match="device_loop: method 'h2' of this scene cannot run on a board"):
         hr.render(SCENE, driver=driver, method="h2")
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
         driver.play(np.zeros((1, 2)))

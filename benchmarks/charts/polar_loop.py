@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.charts.poles import logarithms
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import Sampled
+from hapticrender.control.linear import DiscretePlant
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.protocols import Array
 
@@ -31,7 +31,7 @@ class PolarLoop:
 
     Parameters
     ----------
-    plant : Sampled
+    plant : DiscretePlant
         What the loop closes on.
     delay : int, samples
     frequency : ndarray, shape (B,), Hz
@@ -45,7 +45,7 @@ class PolarLoop:
         Sections b0 b1 b2 a1 a2 of the estimator and of the loop controller.
     """
 
-    plant: Sampled
+    plant: DiscretePlant
     delay: int
     frequency: Array
     measured: Array
@@ -57,7 +57,7 @@ class PolarLoop:
     @classmethod
     def on(
         cls,
-        plant: Sampled,
+        plant: DiscretePlant,
         model: DeviceModel,
         frequency: Array,
         bandwidth: Array,
@@ -68,7 +68,7 @@ class PolarLoop:
 
         Parameters
         ----------
-        plant : Sampled
+        plant : DiscretePlant
         model : DeviceModel
             The free device, of which the look-up table is made.
         frequency, bandwidth : ndarray, shape (B,), Hz

@@ -12,7 +12,7 @@ from benchmarks.charts.polar_loop import PolarLoop
 from benchmarks.charts.poles import loop_poles
 from hapticrender.control.damping import choose_damping, damping_taps, oscillators
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import ErrorLoop, Sampled
+from hapticrender.control.linear import DiscretePlant, ErrorLoop
 from hapticrender.control.margin_check import error_loop
 from hapticrender.control.margins import sensitivity
 from hapticrender.plants.plate import PlateParameters, structure
@@ -35,7 +35,7 @@ def loaded_plate(
     *,
     position: float = 0.0,
     strength: float = 1.0,
-) -> Sampled:
+) -> DiscretePlant:
     """Plate with a finger resting on it, in the coordinates of the controller and per force that it demands.
 
     Parameters
@@ -52,7 +52,7 @@ def loaded_plate(
     loaded = structure(parameters, mechanics, position, strength)
     a, b = loaded.zero_order_hold(parameters.rate)
     shown = model.coordinate_from_sensed @ loaded.outputs[1:3]
-    return Sampled(
+    return DiscretePlant(
         rate=parameters.rate,
         a=a,
         b=b[:, :-1] @ np.linalg.pinv(model.force_from_drive),
@@ -69,7 +69,7 @@ class Case:
     load: float  # N
     position: float  # m
 
-    def plant(self) -> Sampled:
+    def plant(self) -> DiscretePlant:
         """The plate with it."""
         strength = float(self.mechanics.load_factor(np.asarray(self.load)))
         return loaded_plate(PLATE, MODEL, self.mechanics, position=self.position, strength=strength)

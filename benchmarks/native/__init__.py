@@ -98,7 +98,7 @@ class TunedBlock:
     The only place of the benchmarks that reads the internals of a controller: C has to start from the same numbers.
     """
 
-    names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "forget", "ramp", "fast_pole")
+    names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "leak", "ramp", "fast_pole")
     names += ("slow_pole", "fast_threshold", "slow_threshold", "limit", "sensed_limit", "step")
 
     def __init__(self, controller):
@@ -119,7 +119,7 @@ class TunedBlock:
             "g": state["response_gain"],
             "lead": p["extrapolation"],
             "back": 0.0,
-            "forget": LEAK,
+            "leak": LEAK,
             "ramp": p["fade_in"] * self.block,
             "limit": p["drive_limit"],
             "sensed_limit": p["sensor_limit"],

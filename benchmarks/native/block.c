@@ -11,7 +11,7 @@ typedef long mask __attribute__((vector_size(64)));
 #define MIN(a, b) ((a) < (b) ? (a) : (b))
 
 typedef struct {
-    double rate, block_rate, g, dc, dc_drift, lead, integral, back, forget, ramp;
+    double rate, block_rate, g, dc, dc_drift, lead, integral, back, leak, ramp;
     double fast_pole, slow_pole, fast_threshold, slow_threshold, limit, sensed_limit, step;
     double listen[2][2], speak[2][2], pattern[2], rounding[2][2];
 } Numbers;
@@ -145,7 +145,7 @@ void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables
                 TURN(a[2], a[3])
                 a[0] += even[0], a[1] -= odd[0], a[2] += even[1], a[3] -= odd[1];
             }
-            v share = band[R_SHARE], fading = n->forget * (1 - share);
+            v share = band[R_SHARE], fading = n->leak * (1 - share);
             for (int c = 0; c < 2; c++) {
                 v *own = loop + R_LOOP_ROWS * c, fast2 = {}, slow2 = {};
                 v found[2] = {a[2 * c] * cosine + a[2 * c + 1] * sine, a[2 * c + 1] * cosine - a[2 * c] * sine};

@@ -3,7 +3,7 @@
 #include <math.h>
 
 typedef struct {
-    double frequency, turns, amplitude, heading_re, heading_im;
+    double frequency, turns, amplitude, phasor_re, phasor_im;
     struct { double drive, re1, re2, im1, im2, amplitude1, amplitude2, theta1, theta2; } channel[2];
 } Band;
 
@@ -28,16 +28,16 @@ void naive_run(Band *bands, int count, double rate, const double *filter, const 
                 double complex u = 2.0 * y[2 * n + c] * conj(carrier);
                 double re = section(filter, &band->channel[c].re1, &band->channel[c].re2, creal(u));
                 double im = section(filter, &band->channel[c].im1, &band->channel[c].im2, cimag(u));
-                double lag = atan2(im * band->heading_re - re * band->heading_im,
-                                   re * band->heading_re + im * band->heading_im);
+                double lag = atan2(im * band->phasor_re - re * band->phasor_im,
+                                   re * band->phasor_re + im * band->phasor_im);
                 if (lag > M_PI / 2) lag -= 2.0 * M_PI;
                 double theta = section(law, &band->channel[c].theta1, &band->channel[c].theta2, -lag);
                 double error = band->amplitude - sqrt(re * re + im * im);
                 double command = fmax(law[0] * error + band->channel[c].amplitude1, 0.0);
                 band->channel[c].amplitude1 = law[1] * error - law[3] * command + band->channel[c].amplitude2;
                 band->channel[c].amplitude2 = law[2] * error - law[4] * command;
-                double complex heading = (band->heading_re + I * band->heading_im) * cexp(I * theta);
-                drive[2 * n + c] += command * band->channel[c].drive * creal(heading * carrier);
+                double complex phasor = (band->phasor_re + I * band->phasor_im) * cexp(I * theta);
+                drive[2 * n + c] += command * band->channel[c].drive * creal(phasor * carrier);
             }
         }
     }

@@ -83,6 +83,6 @@ uint8_t board_play(board_t *board, const frame *from)
     if (get_u32(from->payload) != next->digest) {
         return REASON_DIGEST;
     }
-    textures_exchange(&board->textures, board->sample + LAW_LOOKAHEAD, board->state == BOARD_IDLE);
+    textures_replace(&board->textures, board->sample + LAW_LOOKAHEAD, board->state == BOARD_IDLE);
     return REASON_NONE;
 }

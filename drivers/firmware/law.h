@@ -83,9 +83,8 @@ typedef struct {
     uint32_t hold;                             /* samples */
     /* learning */
     uint32_t learning_delay, relearning_delay, initial_end, report_delay, loss_time; /* samples */
-    real_t noise[2], model_error;                         /* m^2, and part of the deviation's power */
-    real_t levelling_pole;                                /* a sample */
-    real_t prior[LAW_PARAMETERS], reversion_step[LAW_PARAMETERS], initial_variance[4]; /* means; 1 - a_i */
+    real_t noise[2], model_error, levelling_pole;         /* m^2; part of the deviation's power; a sample */
+    real_t prior[LAW_PARAMETERS], reversion[LAW_PARAMETERS], initial_variance[4]; /* means; 1 - a_i */
     real_t prior_covariance[LAW_PARAMETERS][LAW_PARAMETERS];
 } design_t;
 

@@ -354,10 +354,9 @@ void learning_revert(law_t *law)
     const design_t *d = law->design;
     const uint32_t end = end_active(law);
     for (uint32_t i = 0u; i < end; i++) {
-        v->theta[i] += d->reversion_step[i] * (d->prior[i] - v->theta[i]);
+        v->theta[i] += d->reversion[i] * (d->prior[i] - v->theta[i]);
         for (uint32_t j = i; j < end; j++) {
-            const real_t *step = d->reversion_step;
-            const real_t share = step[i] + step[j] - step[i] * step[j];
+            const real_t share = d->reversion[i] + d->reversion[j] - d->reversion[i] * d->reversion[j];
             const real_t found = v->covariance[i][j] + share * (d->prior_covariance[i][j] - v->covariance[i][j]);
             v->covariance[i][j] = found;
             v->covariance[j][i] = found;

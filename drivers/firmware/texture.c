@@ -29,7 +29,7 @@ uint32_t texture_left(const texture_t *texture, uint32_t at)
     return (left <= TEXTURE_RING) ? left : 0u; /* more: it wrapped, as `at` lies beyond the last sample */
 }
 
-void textures_exchange(textures_t *textures, uint32_t began, uint32_t at_once)
+void textures_replace(textures_t *textures, uint32_t began, uint32_t at_once)
 {
     texture_t *next = textures_next(textures);
     next->began = began;
@@ -39,7 +39,7 @@ void textures_exchange(textures_t *textures, uint32_t began, uint32_t at_once)
     textures->weight = (at_once != 0u) ? REAL(1.0) : REAL(0.0);
 }
 
-/* What lies in time at sample `at`; it fades out before the ring runs dry, and in again once it is filled. */
+/* The texture in time at sample `at`; it fades out before the ring runs dry, and in again once it is filled. */
 static real_t in_time(texture_t *texture, uint32_t at, real_t step, uint32_t *dry)
 {
     if (texture->timed == 0u) {
@@ -54,7 +54,7 @@ static real_t in_time(texture_t *texture, uint32_t at, real_t step, uint32_t *dr
                        : REAL(0.0);
 }
 
-/* What lies along the surface at a position (m): cubic interpolation; the ends of the profile go on. */
+/* The profile at a position (m): cubic interpolation; the ends of the profile go on. */
 static real_t along_surface(const texture_t *texture, real_t position)
 {
     if (texture->points == 0u) {

@@ -47,7 +47,7 @@ texture_t *textures_next(textures_t *textures);
 uint32_t texture_left(const texture_t *texture, uint32_t at);
 
 /* Let the next one begin with sample `began` of the board's clock, faded into within 40 ms, or at once. */
-void textures_exchange(textures_t *textures, uint32_t began, uint32_t at_once);
+void textures_replace(textures_t *textures, uint32_t began, uint32_t at_once);
 
 /*
  * Advance by a sample: reference (m) at sample `at`, which lies LAW_LOOKAHEAD samples ahead of the finger's `position`

@@ -192,8 +192,8 @@ def update_targets(controller, signals, first):
     """
     c = record(controller, CONTROLLER_T, 0)
     p, io = c.p, record(signals, SIGNALS_T, 0)
-    rate, row, calm = p.rate / p.block, first // p.block, crowding(controller) if p.block == 1 else 1.0
-    follow = min(0.5 * calm * p.waveform_gain * p.block, 1.0)
+    rate, row, crowded_gain = p.rate / p.block, first // p.block, crowding(controller) if p.block == 1 else 1.0
+    follow = min(0.5 * crowded_gain * p.waveform_gain * p.block, 1.0)
     factor = samples_of(controller)[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0
     log = carray(pointer(io.target, C16), (row + 1, c.bands))
     for t in range(c.tiles):

@@ -48,7 +48,7 @@ PART = np.dtype(
         ("scale", np.complex128),  # target of the skin's velocity per target of the part; 0: j w
         ("scale_waveform", np.float64),  # of the part per waveform of both
         ("heat", np.float64, (MOST_CHANNELS,)),  # of a part without target: means of the squares of its drives,
-        ("kept", np.float64),  # and the share of them that a block leaves
+        ("heat_decay", np.float64),  # and the share of them that a block leaves
         *((f"{name}_at", np.int64) for name in ("sensed", "drive", "waveform", "target", "flags", "position")),
     ]
 )
@@ -85,7 +85,7 @@ def combined_step(state, signals, start, count):
             if p.bands > 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for k in range(MOST_CHANNELS):
-                p.heat[k] *= p.kept
+                p.heat[k] *= p.heat_decay
             for m in range(block):
                 for k in range(p.channels):
                     drive[first + m, channel + k] = out[m, k]
@@ -103,7 +103,7 @@ class CombinedController(Addressed):
     """Two controllers behind the `Controller` protocol, of plate and friction device; `design_combined` makes one.
 
     A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part,
-    and `kept` is the share of its heat (see `supervisor_kernel.cool`) that a part without target keeps over a sample.
+    `heat_decay` is what a sample leaves of the heat of a part without target (see `supervisor_kernel.limit_rms_drive`).
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class CombinedController(Addressed):
         sensors: tuple[int, int],
         channels: tuple[int, int],
         method: str,
-        kept: tuple[float, float] = (1.0, 1.0),
+        heat_decay: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         self.method, self.parts, self.bands, self.n_bands = method, parts, bands, len(bands)
         self.step, self.part_channels = combined_step, channels
@@ -150,7 +150,7 @@ class CombinedController(Addressed):
                 channels=channels[i],
                 scale=scale,
                 scale_waveform=per_target if bands.envelope is None else 1.0,
-                kept=kept[i] ** self.block,
+                heat_decay=heat_decay[i] ** self.block,
             )
             self.state["parts"][0, i] = own[0]
 
@@ -181,7 +181,7 @@ def design_combined(
         parts.append(part if part is None or each is None else supervised(part, each, feedback=feedback))
     sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
-    kept = math.exp(-1.0 / (model.plate.rms_time * model.rate)), 1.0  # limits of rms drive are the plate's
+    heat_decay = math.exp(-1.0 / (model.plate.rms_time * model.rate)), 1.0  # limits of rms drive are the plate's
     name = getattr(method, "name", "")
     both = parts[0], parts[1]
-    return CombinedController(both, bands, model.velocity_per_force, sensors, channels, name, kept)
+    return CombinedController(both, bands, model.velocity_per_force, sensors, channels, name, heat_decay)

@@ -35,7 +35,7 @@ FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite t
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0
-PROMPT = 8  # samples: a longer delay is that of a block device, where the inner damper would act on stale noise
+MOST_DAMPER_DELAY = 8  # samples: a longer delay is that of a block device, where a damper would act on stale noise
 PHASE_MARGIN = math.pi / 4  # rad: 90 deg less integral gain times (delay + 1/observer pole)
 ADAPTATION_SHARE = 0.5  # of a residual, adapted in a step at most: at 0.8 it swings under a light finger
 ADAPTATION_TIME = 1 / 60  # s: fastest adaptation to what is always there; a delay counts twice
@@ -118,17 +118,17 @@ def design_controller(
     """
     refuse_whole_waveform(bands)
     rules = rules.scaled(model.pace)
-    prompt = model.delay <= PROMPT
-    damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and prompt else None
+    by_sample = model.delay <= MOST_DAMPER_DELAY
+    damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and by_sample else None
     if damping is None or not damping.margins:
         rules = replace(rules, damper=(0.0, 0.0))
     elif model.always_damped:
         rules = replace(rules, damper=(rules.damper[1], rules.damper[1]))
     if (bands.wavenumber > 0.0).any():  # what is left over at one frequency is wrong at the next
         rules = replace(rules, rest=(0.0, 0.0))
-    block = model.block if model.block > 1 and not prompt else 1
+    block = model.block if model.block > 1 and not by_sample else 1
     settings = _settings(model, bands, rules, damping, feedback)
-    why = "the method has none" if prompt else f"a delay of {model.delay} samples is that of a block device"
+    why = "the method has none" if by_sample else f"a delay of {model.delay} samples is that of a block device"
     notes = [damping.text() if damping else f"inner damper off: {why}"]
     if feedback:
         taps = damping.taps if damping else None

@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import Sampled
+from hapticrender.control.linear import DiscretePlant
 from hapticrender.control.margins import LEAST, Margins, margins_of, unstable_poles
 from hapticrender.control.records import MOST_TAPS
 from hapticrender.protocols import Array
@@ -144,7 +144,7 @@ class DamperLoop:
             self.modes.append((2 * np.pi * bending.frequency, ratio, 1.0 / bending.coupling[c]))
         omega, ratio, mass = np.array(self.modes).T
         diagonal = np.diag(mass), np.diag(2 * ratio * omega * mass), np.diag(omega**2 * mass)
-        self.plant = Sampled.free(*diagonal, part.rate)
+        self.plant = DiscretePlant.free(*diagonal, part.rate)
 
     def response(self, frequency: Array) -> Array:
         """L at `frequency` (Hz), shape (n, 1, 1)."""

@@ -8,10 +8,10 @@ F_nom = (M r'' + C r' + K r) alpha.  The true one moves by alpha r + dev (docs/t
 Everything that is not known is linear in parameters theta_i: the finger z on r, r', r'' and on r through one pair of
 poles, the device's errors dD of stiffness, damping, mass and delay, and the finger's load.  With G the loaded device,
 
-    dev = dev_u - sum_i theta_i psi_i + noise,       psi_i = G [alpha_i beta_i],   dev_u = G [F_dev]
+    dev = dev_u - sum_i theta_i psi_i + noise,       psi_i = G [gamma_i beta_i],   dev_u = G [F_dev]
 
 holds whatever was played, and a Kalman filter finds theta; no stability limit follows from how fast it learns.  What it
-finds is played ahead, F = F_nom + sum_i theta_i alpha_i beta_i, with the inner damper on dev for a while after contact.
+finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner damper on dev for a while after contact.
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 

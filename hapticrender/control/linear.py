@@ -21,7 +21,7 @@ from hapticrender.protocols import Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Sampled:
+class DiscretePlant:
     """A device at sample rate (Hz), its force held over each sample: x[n+1] = a x[n] + b f[n], q[n] = c x[n]."""
 
     rate: float
@@ -30,7 +30,7 @@ class Sampled:
     c: Array
 
     @classmethod
-    def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> Sampled:
+    def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> DiscretePlant:
         """Discretise M q'' + C q' + K q = f (kg, N s/m, N/m) exactly."""
         n = len(mass)
         a, b = zoh(*state_space(mass, damping, stiffness, np.eye(n)), 1.0 / rate)
@@ -56,7 +56,7 @@ class Sampled:
 class ErrorLoop:
     """Linear loop of the error observer with K bands and its law on a device of c coordinates."""
 
-    plant: Sampled
+    plant: DiscretePlant
     delay: int  # samples from a sensed sample to its force taking effect, >= 1
     frequency: Array  # (K,), Hz
     observer: float  # gain g per sample

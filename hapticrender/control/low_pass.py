@@ -86,17 +86,17 @@ def look_up(controller, t):
 
 
 @kernel
-def set_heading(controller, t):
+def set_reference_phasor(controller, t):
     """Set amplitude and direction of the reference of a tile; in silence the last direction stays."""
     c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
     reference, omega = get(b, "r"), get(b, "omega")
-    amount = sqrt(square(reference))
-    sounds = amount > SILENCE
-    put(b, "amount", amount)
-    put(b, "sounds", where(sounds, 1.0, 0.0))
-    put(b, "heading", where(sounds, reference / maximum(amount, SILENCE), get(b, "heading")))
-    put(b, "direction", where(omega > 0.0, 1.0, where(omega < 0.0, -1.0, get(b, "direction"))))
+    r_magnitude = sqrt(square(reference))
+    r_nonzero = r_magnitude > SILENCE
+    put(b, "r_magnitude", r_magnitude)
+    put(b, "r_nonzero", where(r_nonzero, 1.0, 0.0))
+    put(b, "r_phasor", where(r_nonzero, reference / maximum(r_magnitude, SILENCE), get(b, "r_phasor")))
+    put(b, "omega_sign", where(omega > 0.0, 1.0, where(omega < 0.0, -1.0, get(b, "omega_sign"))))
 
 
 @kernel
@@ -115,17 +115,17 @@ def polar_loops(controller, t, i, envelope):
     """Command (amplitude, phase) of a tile in coordinate i from the errors of amplitude and phase."""
     c = record(controller, CONTROLLER_T, 0)
     b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
-    heading, direction = get(b, "heading"), get(b, "direction")
+    r_phasor, omega_sign = get(b, "r_phasor"), get(b, "omega_sign")
     if c.p.subtracted > 0.0:  # each angle with a seam of its own
-        size, angle = polar(pair(real(envelope), direction * imag(envelope)))
-        _, aimed = polar(pair(real(heading), direction * imag(heading)))
+        size, angle = polar(pair(real(envelope), omega_sign * imag(envelope)))
+        _, aimed = polar(pair(real(r_phasor), omega_sign * imag(r_phasor)))
         angle = angle - aimed
     else:
-        turned = envelope * conj(heading)
-        size, angle = polar(pair(real(turned), direction * imag(turned)))
+        turned = envelope * conj(r_phasor)
+        size, angle = polar(pair(real(turned), omega_sign * imag(turned)))
     # a negative amplitude would be positive feedback
     floor = 0.0 if c.p.clamped > 0.0 else -math.inf
-    out = loop_controller(controller, x, pair(get(b, "amount") - size, get(b, "sounds") * angle), floor)
+    out = loop_controller(controller, x, pair(get(b, "r_magnitude") - size, get(b, "r_nonzero") * angle), floor)
     return real(out), -1.0 * imag(out)
 
 
@@ -144,13 +144,13 @@ def polar_law(controller):
             if i == 0 and (c.stale > 0 or b.mode[0] == LOCKED):
                 look_up(controller, t)
             if i == 0 and (c.stale > 0 or b.mode[0] != FIXED):
-                set_heading(controller, t)
+                set_reference_phasor(controller, t)
             if c.p.feedback > 0.0:
                 amplitude, angle = polar_loops(controller, t, i, estimate(controller, t, i, samples[Y + i, 0]))
             else:
-                amplitude, angle = get(b, "amount"), c.p.lead * magnitude(get(b, "omega")) - get(x, "lag")
-            turn, wave = unit((1.0 / TURN) * angle), get(b, "heading") * get(b, "carrier")
-            wave = real(wave) * real(turn) - get(b, "direction") * imag(wave) * imag(turn)
+                amplitude, angle = get(b, "r_magnitude"), c.p.lead * magnitude(get(b, "omega")) - get(x, "lag")
+            turn, wave = unit((1.0 / TURN) * angle), get(b, "r_phasor") * get(b, "carrier")
+            wave = real(wave) * real(turn) - get(b, "omega_sign") * imag(wave) * imag(turn)
             drive = drive + get(x, "drive") * amplitude * wave
         samples[SUM + i, 0] = total(drive)
     c.stale = 0

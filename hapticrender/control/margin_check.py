@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import ErrorLoop, Sampled
+from hapticrender.control.linear import DiscretePlant, ErrorLoop
 from hapticrender.control.margins import LEAST, LeastMargins, Margins
 from hapticrender.errors import DesignError
 from hapticrender.mathx import smoothstep
@@ -18,7 +18,7 @@ Settings = Mapping[str, Any]  # of a controller, by the names of `records.SETTIN
 SPEEDS = 5  # of the finger, at which carriers locked to it are checked
 STEPS = 2.0 ** (-np.arange(25) / 4)  # of the bandwidth tried, in turn: each a quarter octave lower, down to 1/64
 SOFTER = (*STEPS[1:9].tolist(), 0.0)  # of the inner damper: down to a quarter, then off
-ROOM = 0.25  # of the bandwidth of the rule: the inner damper is softened until this much holds
+LEAST_SHARE = 0.25  # of the bandwidth of the rule: the inner damper is softened until this much holds
 SCHEDULE = {"low": (0.0, 0.0), "medium": (0.0, 1.0), "high": (1.0, 0.0)}
 """Levels of the gain schedule: how far the fast and the slow detector have raised the gains."""
 GROUPS = (  # levels that share an observer, and what is lowered for them
@@ -81,7 +81,7 @@ def error_loop(
     jw = 2j * np.pi * frequency[:, None, None]
     rho = np.exp(jw * settings["lead"]) / np.sinc(frequency / model.rate)[:, None, None]
     return ErrorLoop(
-        plant=Sampled.free(model.mass, model.damping, model.stiffness, model.rate),
+        plant=DiscretePlant.free(model.mass, model.damping, model.stiffness, model.rate),
         delay=model.delay,
         frequency=frequency,
         observer=observer,
@@ -174,14 +174,14 @@ def _lowered(
     if not first:
         return settings, []
     name, notes = " and ".join(levels), []
-    cramped = complaint(_scaled(settings, rates, ROOM), levels)
-    if cramped and settings[damper] > 0.0:
+    narrow = complaint(_scaled(settings, rates, LEAST_SHARE), levels)
+    if narrow and settings[damper] > 0.0:
         for soft in SOFTER:
             softer = _scaled(settings, (damper,), soft)
-            if not complaint(_scaled(softer, rates, ROOM), levels):
+            if not complaint(_scaled(softer, rates, LEAST_SHARE), levels):
                 settings = softer
                 notes.append(
-                    f"inner damper ({name}) softened to {soft:.0%}: even at {ROOM:.0%} of the bandwidth {cramped}"
+                    f"inner damper ({name}) softened to {soft:.0%}: even at {LEAST_SHARE:.0%} of the bandwidth {narrow}"
                 )
                 break
     for step in STEPS.tolist():

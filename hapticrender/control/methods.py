@@ -33,7 +33,7 @@ from hapticrender.control.controller import (
 from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, design_controller, rules_for
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import AdaptiveInverse
-from hapticrender.control.linear import Sampled
+from hapticrender.control.linear import DiscretePlant
 from hapticrender.control.loopshape import (
     Bandwidths,
     TransferFunction,
@@ -170,7 +170,7 @@ class Resonant:
 
 def least_decay(model: DeviceModel) -> float:
     """Decay rate of the least damped mode of the free device, 1/s."""
-    poles = np.linalg.eigvals(Sampled.free(model.mass, model.damping, model.stiffness, model.rate).a)
+    poles = np.linalg.eigvals(DiscretePlant.free(model.mass, model.damping, model.stiffness, model.rate).a)
     return float(-model.rate * np.log(abs(poles)).max())
 
 
@@ -235,7 +235,7 @@ def low_pass_controller(
     """Controller of a method with a low pass."""
     loops = aligned(settings["coordinates"] * tiles_of(bands), LOW_PASS)
     controller = BankController(name, low_pass_step, settings, bands, arrays={"loops": loops} | (arrays or {}))
-    controller.tiles["heading_re"] = controller.tiles["direction"] = 1.0
+    controller.tiles["r_phasor_re"] = controller.tiles["omega_sign"] = 1.0
     return controller
 
 

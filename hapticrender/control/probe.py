@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.linear import Sampled
+from hapticrender.control.linear import DiscretePlant
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Driver
@@ -82,7 +82,7 @@ def probe_plate(driver: Driver, model: DeviceModel) -> None:
 
 def probe_drive(model: DeviceModel) -> Array:
     """Lines of the probe (drive unit, shape (n, 2)), from rest to rest."""
-    modes = Sampled.free(model.mass, model.damping, model.stiffness, model.rate).modes()
+    modes = DiscretePlant.free(model.mass, model.damping, model.stiffness, model.rate).modes()
     lines = np.hstack([LOW * modes.min(), HIGH * modes.max()])
     time = np.arange(round(DURATION * model.rate)) / model.rate
     gains = np.array([*[1.0] * LOW.shape[1], *HIGH_GAIN]) * (lines < 0.4 * model.rate)
@@ -143,7 +143,7 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
 
 def _response(model: DeviceModel, drive: Array) -> Array:
     """What the free device's sensors show under a drive (n, channels), shape (n, sensors)."""
-    plate = Sampled.free(model.mass, model.damping, model.stiffness, model.rate)
+    plate = DiscretePlant.free(model.mass, model.damping, model.stiffness, model.rate)
     forces, state = drive @ (plate.b @ model.force_from_drive).T, np.zeros(len(plate.a))
     states = np.empty((len(drive), len(state)))
     for n, force in enumerate(forces):

@@ -58,8 +58,8 @@ TILE_FIELDS = [
     *_complex("remainder"),  # stiffness of the finger beyond its three numbers
     *_complex("finger_force", "filtered_r"),  # adaptation: the finger's force, R and omega, delayed and filtered like
     *("filtered_omega", "complete"),  # the observer; share of a carrier's own history in them
-    *("amount", "sounds", "direction"),  # polar law: |R|, whether that is no silence, sign of the carrier's frequency
-    *_complex("heading"),  # R/|R|, the last one in silence
+    *("r_magnitude", "r_nonzero", "omega_sign"),  # polar law: |R|, whether it is above `SILENCE`, sign of the frequency
+    *_complex("r_phasor"),  # R/|R|, the last one in silence
     *_complex(*(f"{name}{i}" for i in (0, 1) for name in COORDINATE_NAMES)),
     *_complex(*(f"{name}{i}{j}" for i in (0, 1) for j in (0, 1) for name in STIFFNESS_NAMES)),
 ]

@@ -29,7 +29,7 @@ from hapticrender.protocols import Array
 if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
-PROMPT = 8  # samples: with a longer delay there is no inner loop
+MOST_INNER_DELAY = 8  # samples: with a longer delay there is no inner loop
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
 PACED_DELAY_ALONE = 1 / 40  # s, of pace times the delay, where there is none: see `resonant` for both
 TAPS = 6  # of the inner loop: at 384 kHz three need a drive eight times as noisy for a sixth more of damping
@@ -159,7 +159,7 @@ def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> Dev
 
 def _pace(model: DeviceModel) -> float:
     """Bandwidth of the amplitude loop over that of a plate's rules."""
-    if model.delay <= PROMPT and turns(oscillators(model)) <= 1.0:
+    if model.delay <= MOST_INNER_DELAY and turns(oscillators(model)) <= 1.0:
         return PACED_DELAY * model.rate / (model.delay + 1)
     return PACED_DELAY_ALONE * model.rate / model.delay
 

@@ -17,7 +17,7 @@ from hapticrender.recordings.envelopes import (
     amplitude_error,
     judged_from,
 )
-from hapticrender.recordings.verdict import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
+from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
 
 if TYPE_CHECKING:
     from hapticrender.recordings.journal import Header
@@ -44,7 +44,7 @@ def summary(recording: Recording) -> dict[str, Any]:
     is flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside
     20 to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said and no
     sample is flagged.  `worst` is the figure furthest over its `bound`; `reason` states what else decided.  See
-    ``verdict`` for the equations.  `contacts` are the errors after touches and lifts; `delay` (s), `gain` and
+    ``waveform_figures`` for the equations.  `contacts` are the errors after touches and lifts; `delay` (s), `gain` and
     `incoherent` share state how y differs from r and decide nothing, like all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the

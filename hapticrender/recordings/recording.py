@@ -19,7 +19,7 @@ from hapticrender.recordings import formats, journal, judge
 from hapticrender.recordings.envelopes import Envelopes, analyse
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
-from hapticrender.recordings.verdict import waveform_figures
+from hapticrender.recordings.waveform_figures import waveform_figures
 
 if TYPE_CHECKING:
     from hapticrender.recordings.columns import Chosen
@@ -272,7 +272,7 @@ class Recording:
 
     @cached_property
     def waveform(self) -> dict[str, Any]:
-        """Figures of the motion against the reference (computed once), see ``verdict.waveform_figures``."""
+        """Figures of the motion against the reference (computed once), see ``waveform_figures``."""
         return waveform_figures(self)
 
     def summary(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from hapticrender.formatting import percent
 from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import RUNAWAY
-from hapticrender.recordings.verdict import LOOSER
+from hapticrender.recordings.waveform_figures import LOOSER
 from hapticrender.report import figure as look
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure
 from hapticrender.report.text import verdict

@@ -51,7 +51,7 @@ def _terms(texture: Any) -> Parts:
     return texture.parts if isinstance(texture, Sum) else ((texture, 1.0),)
 
 
-def lies_along_surface(texture: Texture) -> bool:
+def is_spatial(texture: Texture) -> bool:
     """Whether a texture is read at the finger's position: its `spatial` says so; without that, its bands do."""
     stated = getattr(texture, "spatial", None)
     return bool(texture.bands(NOMINAL_RATE).follows_finger if stated is None else stated)
@@ -67,33 +67,32 @@ def refuse_to_overwrite(texture: Texture, path: Any) -> None:
 
 
 class SeparatedTexture:
-    """A texture, parted into what lies in time (`timed`: anything does) and along the surface (`spatial`).
+    """A texture, parted into functions of time (`timed`: any part) and of position (`spatial`).
 
-    It is in time, along the surface (see `lies_along_surface`), or a `Sum` of both; `waveform_of` a part is its
+    It is in time, along the surface (see `is_spatial`), or a `Sum` of both; `waveform_of` a part is its
     waveform in the device's quantity, by default its own.  A ValueError where its parts are in time and along the
-    surface, and it is no sum; or what lies along the surface is not the same at all `READINGS`, or what lies in time
+    surface, and it is no sum; or a function of position is not the same at all `READINGS`, or one of time
     not at all `PLACES`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
         terms, name = _terms(texture), type(texture).__name__
         for each, _ in terms:
-            kinds = {lies_along_surface(part) for part, _ in getattr(each, "parts", ())}
+            kinds = {is_spatial(part) for part, _ in getattr(each, "parts", ())}
             if kinds == {True, False} or (True in kinds and not isinstance(each, Sum)):
                 problem = f"{type(each).__name__} with a part along the surface"
                 raise ValueError(f"{problem}: play its parts one after another")
         self._terms = [
-            (each, lies_along_surface(each), waveform_of(each) if waveform_of else each.waveform, gain)
-            for each, gain in terms
+            (each, is_spatial(each), waveform_of(each) if waveform_of else each.waveform, gain) for each, gain in terms
         ]
         self.timed, self.spatial = (any(along == kind for _, along, _, _ in self._terms) for kind in (False, True))
         if self.spatial and self._varies(True, READINGS, 0):
-            raise ValueError(f"{name}: must not change with time: it lies along the surface")
+            raise ValueError(f"{name}: must not change with time: it is a function of position")
         if self.timed and (
             self._varies(False, SOON, 1) or (self.in_time(SOON) != self._sum(False, SOON, 0.0 * SOON)).any()
         ):
             raise ValueError(
-                f"{name}: must not change with the finger's position or contact, or with each reading: it lies in time"
+                f"{name}: must not change with the finger's position or contact, or a reading: it is a function of time"
             )
 
     def _varies(self, spatial: bool, times: Array, axis: int) -> bool:
@@ -102,11 +101,11 @@ class SeparatedTexture:
         return bool(np.ptp(found, axis=axis).max() > 1e-6 * abs(found).max())
 
     def in_time(self, time: Array) -> Array:
-        """Sum of what lies in time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
+        """Sum of the functions of time, at `time` (s, shape (n,)); a ValueError where it is not finite."""
         return self._sum(False, time, np.full(len(time), np.nan))
 
     def along_surface(self, position: Array) -> Array:
-        """Sum of what lies along the surface, at `position` (m, shape (n,); 0 where it is NaN)."""
+        """Sum of the functions of position, at `position` (m, shape (n,); 0 where it is NaN)."""
         return self._sum(True, np.zeros(len(position)), position)
 
     def _sum(self, spatial: bool, time: Array, position: Array) -> Array:
@@ -134,11 +133,11 @@ class _Composed(Composable):
     @property
     def spatial(self) -> bool:
         """Whether any part is read at the finger's position."""
-        return any(lies_along_surface(texture) for texture, _ in self.parts)
+        return any(is_spatial(texture) for texture, _ in self.parts)
 
     @property
     def _follows_finger(self) -> bool:
-        return all(lies_along_surface(texture) for texture, _ in self.parts)
+        return all(is_spatial(texture) for texture, _ in self.parts)
 
     def _bands_of_parts(self, rate: float) -> list[Bands]:
         """Bands of every part; a ValueError where `rate` (Hz) carries none of a part's, not even the lowest."""

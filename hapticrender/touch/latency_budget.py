@@ -2,7 +2,7 @@
 
 A texture over position is played at 2 pi x/wavelength, so an error dx of the position is a phase error of
 360 degrees dx/wavelength.  The estimator of `hapticrender.touch.motion_estimator` has settled on samples every T with
-the gain k.  Its estimate and the correction that is still being eased in (two poles of tau, `PanelReader`) are linear::
+the gain k.  Its estimate and the correction that is still being faded in (two poles of tau, `PanelReader`) are linear::
 
     z[n] = A z[n-1] + B y[n],   z = [x, v, a, c1, c2],   x_played(t_n + h) = C(h) z[n]
 
@@ -21,7 +21,7 @@ import numpy as np
 from hapticrender.checks import number, require
 from hapticrender.protocols import Array
 from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator, jerk_covariance, transition
-from hapticrender.touch.touch_panel import EASING, TouchPanel
+from hapticrender.touch.touch_panel import CORRECTION_TIME, TouchPanel
 
 AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors are averaged
 MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
@@ -67,7 +67,7 @@ def position_error(
     frequency: float = FREQUENCY,
     delay: float = 0.0,
     predicted: bool = True,
-    easing: float = EASING,
+    easing: float = CORRECTION_TIME,
 ) -> float:
     """Error of the position at which a texture is played (m rms), for a swipe and all its reversals.
 

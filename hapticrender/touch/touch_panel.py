@@ -12,7 +12,7 @@ from hapticrender.checks import Validated, parameter
 from hapticrender.protocols import Array
 from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator
 
-EASING = 5e-3  # s: a correction of the estimate is spread by two poles of this time, so that no texture steps
+CORRECTION_TIME = 5e-3  # s: a correction of the estimate is spread by two poles of this time, so that no texture steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class PanelReader:
         self._samples, self._scans, self._last = 0, 0, np.nan  # positions so far, scans so far, the last position (m)
         self._pending: deque[tuple[float, float]] = deque()
         self._arrived = 0.0  # s: the last arrival
-        self._correction, self._changed = np.zeros(2), 0.0  # what is left of it, see `_eased`; since when
+        self._correction, self._changed = np.zeros(2), 0.0  # what is left of it, see `_corrected`; since when
 
     def __call__(self, position: Array) -> Array:
         """Positions (m, shape (n,), NaN: lifted) that are known while the finger is at `position`, (n,)."""
@@ -67,10 +67,10 @@ class PanelReader:
         while self._pending and self._pending[0][0] <= time[-1]:
             arrival, sample = self._pending.popleft()
             last = int(np.searchsorted(time, arrival))
-            found[first:last] = self._eased(time[first:last])
+            found[first:last] = self._corrected(time[first:last])
             self._take(arrival, sample)
             first = last
-        found[first:] = self._eased(time[first:])
+        found[first:] = self._corrected(time[first:])
         return found
 
     def _scanned(self, time: Array, position: Array) -> Iterator[tuple[float, float]]:
@@ -91,17 +91,17 @@ class PanelReader:
 
     def _take(self, arrival: float, sample: float) -> None:
         """Hand a sample to the estimator; the position goes on from where it is."""
-        before = self._eased(np.array([arrival]))[0]
+        before = self._corrected(np.array([arrival]))[0]
         self.estimator.update(arrival, sample)
         jump = before - self.estimator.at(arrival).position
-        u = (arrival - self._changed) / EASING
+        u = (arrival - self._changed) / CORRECTION_TIME
         first, second = self._correction
         # two poles in series: the jump enters both, what the first had on its way to the second stays on its way
         self._correction = np.array([first * np.exp(-u) + jump - (second + u * first) * np.exp(-u), jump])
         self._correction, self._changed = np.nan_to_num(self._correction), arrival  # after a lift there is none
 
-    def _eased(self, time: Array) -> Array:
+    def _corrected(self, time: Array) -> Array:
         """Estimated positions (m) at `time` (s), with what is left of the last correction."""
-        u = (time - self._changed) / EASING
+        u = (time - self._changed) / CORRECTION_TIME
         first, second = self._correction
         return np.asarray(self.estimator.at(time).position + (second + u * first) * np.exp(-u))

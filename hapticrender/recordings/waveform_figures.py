@@ -1,4 +1,4 @@
-"""Judge the waveform: the motion against the texture as the scene specifies it, without time shift or gain fit.
+"""Figures of the waveform: the motion against the texture as the scene specifies it, without time shift or gain fit.
 
 Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
 rms_b over a third octave b with both edges in B (on a plate also above, see `_thirds`); S_b detection threshold (rms)
@@ -71,8 +71,8 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     frequency, spectrum, cross = _spectra(recording, begin, stop, min(SEGMENT, count) * window)
     inside = _within(frequency, *_band(rate), 2 * frequency[1])
     reference = spectrum[:, 0]
-    level = found["rms_reference"] = math.sqrt(reference.sum())
-    if not level > _least(header.unit):
+    rms = found["rms_reference"] = math.sqrt(reference.sum())
+    if not rms > _least(header.unit):
         return found | {"rms_reference": 0.0}
     found["share_in_band"] = float(reference[inside].sum() / reference.sum())
     found["share_outside"] = _outside(reference, frequency, inside, header.unit)
@@ -85,7 +85,7 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     for i, place in enumerate(places, start=1):
         columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
         errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
-        thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, level, i - 1), share)
+        thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, rms, i - 1), share)
         found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))
     return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
@@ -161,12 +161,12 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
     """Frequencies (Hz), mean square a bin of r, e and y (bins, 1 + 2 places), cross spectrum of r and the first e."""
     shares, scales = _scales(recording.header)
     starts = np.unique([*range(begin, stop - segment + 1, max(segment // 2, 1)), stop - segment])
-    shape = np.hanning(segment + 1)[:-1, None]
-    scale = 2.0 / (segment * (shape**2).sum()) / len(starts)
+    taper = np.hanning(segment + 1)[:-1, None]
+    scale = 2.0 / (segment * (taper**2).sum()) / len(starts)
     power, cross = 0.0, 0.0
     for start in starts:
         values = _signals(recording, start, start + segment)
-        turned = np.fft.rfft(shape * (values - values.mean(axis=0)), axis=0)
+        turned = np.fft.rfft(taper * (values - values.mean(axis=0)), axis=0)
         power += scale * np.abs(np.hstack([turned, turned[:, 1:] + shares / scales * turned[:, :1]])) ** 2
         cross += scale * turned[:, 0].conj() * turned[:, 1]
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
@@ -199,16 +199,16 @@ def _thirds(
     return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}
 
 
-def _floor(recording: Recording, level: float, place: int, middle: float) -> float:
+def _floor(recording: Recording, rms: float, place: int, middle: float) -> float:
     """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it.
 
     S_b is the detection threshold on a plate, of the motion at the place itself; of other quantities, for which none is
-    known, 1 % of the rms `level` of the whole reference.  It is never below twice the noise of the sensors where the
+    known, 1 % of the `rms` of the whole reference.  It is never below twice the noise of the sensors where the
     motion comes from them.
     """
     header = recording.header
     scale = float(_scales(header)[1][place])
-    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale if header.unit == "m" else SPUR * level
+    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale if header.unit == "m" else SPUR * rms
     noise = float(_noise(recording, middle / EDGE, middle * EDGE)[place]) / scale
     return max(least, 2.0 * noise) / (LOOSER * header.tolerance)
 
@@ -250,12 +250,12 @@ def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> d
     return {"delay": float(delay[best]), "gain": found / total, "incoherent": max(incoherent, 0.0)}
 
 
-def _contacts(recording: Recording, begin: int, stop: int, level: float) -> dict[str, Any]:
-    """Count of touches and lifts, and the error after them over the reference's rms `level`, at the worst place."""
+def _contacts(recording: Recording, begin: int, stop: int, rms: float) -> dict[str, Any]:
+    """Count of touches and lifts, and the error after them over the reference's `rms`, at the worst place."""
     edges = [round(seconds * recording.rate) for seconds in AFTER_CONTACT]
     after = [_filtered(recording, at, at + edges[-1]) for at in _events(recording, begin, stop - edges[-1])]
     squares = [[(values[a:b, 1:] ** 2).mean(axis=0) for a, b in pairwise(edges)] for values in after]
-    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / level).tolist() if squares else [None, None]
+    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / rms).tolist() if squares else [None, None]
     return {"count": len(after), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
 
 
