@@ -46,7 +46,7 @@ _HOMES = {
     "touch.motion": "Sampled TriangleMotion Still SineMotion RecordedMotion",
     "touch.motion_estimator": "Encoder MotionEstimator",
     "touch.perception": "detection_threshold roughness sensation_level",
-    "touch.profile": "strongest_carriers",
+    "touch.curve": "strongest_carriers",
     "touch.recorded": "Recorded Swipe Synthetic",
     "touch.scene": "Scene",
     "touch.touch_panel": "TouchPanel",
@@ -98,6 +98,7 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.composed import Chirp as Chirp
     from hapticrender.touch.composed import Playlist as Playlist
     from hapticrender.touch.composed import Sum as Sum
+    from hapticrender.touch.curve import strongest_carriers as strongest_carriers
     from hapticrender.touch.device_profile import DeviceProfile as DeviceProfile
     from hapticrender.touch.finger import Finger as Finger
     from hapticrender.touch.grating import Grating as Grating
@@ -114,7 +115,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.perception import detection_threshold as detection_threshold
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
-    from hapticrender.touch.profile import strongest_carriers as strongest_carriers
     from hapticrender.touch.recorded import Recorded as Recorded
     from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic

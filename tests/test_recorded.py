@@ -49,7 +49,7 @@ def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
 
 def test_beyond_its_ends_a_recording_runs_back_without_a_jump(write, rng):
     texture = Recorded(file=write(rng.uniform(-1, 1, 4001)), amplitude=10e-6)
-    length = texture.profile.length
+    length = texture.curve.length
     assert length == pytest.approx(0.5, rel=1e-12)
     time = np.arange(0, 0.4, 1e-4)
     for end in (0.0, length):
@@ -125,7 +125,7 @@ def test_a_sound_file_of_a_killed_recorder_or_of_a_stream_is_read(write):
     for unknown in (b"\0\0\0\0", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f"):
         riff = b"\x08\0\0\0" if unknown[0] == 0 else unknown
         file.write_bytes(whole[:4] + riff + whole[8:at] + unknown + whole[at + 4 :])
-        assert Recorded(file=file, amplitude=1e-6).profile.length == pytest.approx(2.0, abs=1e-3)
+        assert Recorded(file=file, amplitude=1e-6).curve.length == pytest.approx(2.0, abs=1e-3)
 
 
 def test_what_is_no_sound_file_is_refused(tmp_path):

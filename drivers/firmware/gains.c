@@ -163,7 +163,7 @@ static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t 
             w[j][i] = model_sensor(models[j], p, i);
         }
     }
-    if (s->watched > p->duration / 2u) { /* by then w has forgotten where it began */
+    if (s->watched > p->duration / 2u) { /* by then w no longer depends on where it began */
         add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
     }
     for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {

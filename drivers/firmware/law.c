@@ -93,15 +93,15 @@ static void take_reference(law_t *law, real_t waveform)
     const real_t value = (bands_ahead(law) + faded_waveform(law, waveform)) * law->gain * law->smooth_scale;
     for (uint32_t i = 0u; i + 1u < LAW_FILTER_TAPS; i++) {
         law->window[i] = law->window[i + 1u];
-        law->shown[i] = law->shown[i + 1u];
+        law->sensor_window[i] = law->sensor_window[i + 1u];
     }
     law->window[LAW_FILTER_TAPS - 1] = value;
-    law->shown[LAW_FILTER_TAPS - 1] = law->delayed[law->at_delayed];
+    law->sensor_window[LAW_FILTER_TAPS - 1] = law->delayed[law->at_delayed];
     law->delayed[law->at_delayed] = value;
     law->at_delayed = (law->at_delayed + 1u) % (uint32_t)LAW_DELAY;
     law->reference = REAL(0.0);
     for (uint32_t i = 0u; i < LAW_FILTER_TAPS; i++) {
-        law->reference += law->design->sensor_filter[i] * law->shown[i];
+        law->reference += law->design->sensor_filter[i] * law->sensor_window[i];
     }
 }
 

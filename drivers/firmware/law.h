@@ -126,7 +126,7 @@ typedef struct law {
     real_t drive_limit;                       /* A */
     real_t gain, gain_from, gain_to, gain_change; /* of the reference: now, a change's ends, 0..1 how far it is */
     real_t fade, last_waveform;               /* of the waveform */
-    real_t window[LAW_FILTER_TAPS], shown[LAW_FILTER_TAPS], delayed[LAW_DELAY];
+    real_t window[LAW_FILTER_TAPS], sensor_window[LAW_FILTER_TAPS], delayed[LAW_DELAY];
     real_t reference;                         /* m, what the sensors should show now */
     real_t basis[LAW_BASIS], poles[2];
     real_t ring[LAW_DELAY + 1][LAW_RING];

@@ -437,7 +437,7 @@ void learning_advance(law_t *law, const real_t acting[LAW_RING])
     }
 }
 
-/* Forget all that was learned, and what was noted. */
+/* Reset all that was learned, and what was noted. */
 void learning_reset_all(law_t *law)
 {
     learning_t *v = &law->learning;

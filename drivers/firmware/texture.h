@@ -37,7 +37,7 @@ typedef struct {
     finger_t finger;
 } textures_t;
 
-/* Forget both: nothing plays. */
+/* Clear both: nothing plays. */
 void textures_init(textures_t *textures);
 
 /* The one that does not play, to be described anew. */

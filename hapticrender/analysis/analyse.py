@@ -162,7 +162,7 @@ def _carriers(bands: Bands, sensed: Array, rate: float) -> Array:
     if len(bands):
         fixed = bands.frequency[bands.wavenumber == 0.0]
     else:
-        from hapticrender.touch.profile import strongest_carriers
+        from hapticrender.touch.curve import strongest_carriers
 
         fixed = strongest_carriers(sensed.mean(axis=1), rate, passband=(SLOWEST, FASTEST * rate))
     return np.unique(fixed[(fixed >= SLOWEST) & (fixed <= FASTEST * rate)])

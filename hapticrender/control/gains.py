@@ -227,7 +227,7 @@ def follow_actuators(gains, force0, force1):
     first = RESPONSE + CHANGES * ACTUATOR
     for j in range(CHANGES):
         s.w[j, 0], s.w[j, 1] = model_sensors(gains, first + j)
-    if s.watched > s.duration // 2:  # by then w has forgotten where it began
+    if s.watched > s.duration // 2:  # by then w no longer depends on where it began
         add_sums(gains, ACTUATOR, s.window_pole)
     for j in range(CHANGES):
         f = s.force_of_actuator[j]

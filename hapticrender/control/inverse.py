@@ -261,12 +261,12 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         matrices[name][:n, :n] = getattr(model, name)
     top, order, late = min(model.highest_frequency, HIGHEST * model.rate), int(bands.differentiated), model.sensor_delay
     late *= model.rate  # what is sensed of the target is that of so many samples ago
-    shown = np.eye(TAPS)[TAPS // 2 - 1]
-    rate_shown = np.zeros(TAPS)
+    sensor = np.eye(TAPS)[TAPS // 2 - 1]
+    sensor_rate = np.zeros(TAPS)
     if order or late:
-        shown = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
+        sensor = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
     if model.contact_lag > 0.0:
-        rate_shown = derivative_filters(float(model.rate), float(top), order + 1, 1, -late)[0]
+        sensor_rate = derivative_filters(float(model.rate), float(top), order + 1, 1, -late)[0]
     return {
         "delay": model.delay,
         "spatial": (bands.wavenumber > 0.0).any() if len(bands) else bands.spatial,
@@ -278,8 +278,8 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "fade_step": period / FADE_IN,
         **law_times(model, noise[0]),
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
-        "sensor_filter": shown,
-        "sensor_rate_filter": rate_shown,
+        "sensor_filter": sensor,
+        "sensor_rate_filter": sensor_rate,
         "pole_step": pole_step(model.rate),
         "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         **matrices,

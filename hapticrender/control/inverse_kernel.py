@@ -87,14 +87,14 @@ def take_reference(controller, inverse, waveform):
     else:
         value = bands_ahead(controller, (v.delay + TAPS // 2) / c.p.rate)
     value *= v.smooth_scale
-    window, shown, ring = v.window, v.shown, carray(pointer(v.reference_at, F8), v.delay)
+    window, expected, ring = v.window, v.sensor_window, carray(pointer(v.reference_at, F8), v.delay)
     at = v.sample % v.delay
     for i in range(TAPS - 1):
-        window[i], shown[i] = window[i + 1], shown[i + 1]
-    window[TAPS - 1], shown[TAPS - 1], ring[at] = value, ring[at], value
+        window[i], expected[i] = window[i + 1], expected[i + 1]
+    window[TAPS - 1], expected[TAPS - 1], ring[at] = value, ring[at], value
     v.reference, lag = 0.0, contact_lag(controller)
     for i in range(TAPS):
-        v.reference += (v.sensor_filter[i] + lag * v.sensor_rate_filter[i]) * shown[i]
+        v.reference += (v.sensor_filter[i] + lag * v.sensor_rate_filter[i]) * expected[i]
 
 
 @kernel

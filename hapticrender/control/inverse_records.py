@@ -20,8 +20,8 @@ _LAW = "lever_per_metre omega_n pole pole_damping fade_step"
 _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
 _POLES = "gate_threshold high_pass_pole mean_square_pole hold decay scale_pole levelling_pole power_pole"
-# fade and scale of the reference, the drive's largest need; the finger's lever arm and contact, samples since it
-# changed and since a position was there; the gate's slow part, mean square and noise; r as the sensors
+# the reference's fade, the drive's largest need and for how long it is held, scale; the finger's lever arm, contact,
+# samples since it changed and without a position; the gate's slow part, mean square and noise; r as the sensors should
 # show it; levelling force; mean squares on the untouched device, see `update_powers`; last sane sample of the waveform
 _STATE = """
 fade peak hold_left scale smooth_scale lever contact since away slow power sensed_noise reference moment
@@ -49,7 +49,7 @@ INVERSE = np.dtype(
         *((name, np.float64) for name in _STATE.split()),
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
         ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
-        ("shown", np.float64, (TAPS,)),  # around now
+        ("sensor_window", np.float64, (TAPS,)),  # around now, for what the sensors should show
         ("model_power", np.float64, (2,)),  # mean squares of the deviation and of what the drive explains of it
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),

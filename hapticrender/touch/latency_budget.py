@@ -21,7 +21,7 @@ import numpy as np
 from hapticrender.checks import number, require
 from hapticrender.protocols import Array
 from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator, jerk_covariance, transition
-from hapticrender.touch.touch_panel import CORRECTION_TIME, TouchPanel
+from hapticrender.touch.touch_panel import SMOOTHING, TouchPanel
 
 AGES = (np.arange(16) + 0.5) / 16  # of a sample's time: ages over which errors are averaged
 MOST_LOST = 1e-4  # longer runs of lost samples, of a smaller share, are left out
@@ -40,14 +40,14 @@ def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) ->
     return np.asarray(predicted[:, 0] / (predicted[0, 0] + 1.0) / step ** np.arange(3))
 
 
-def _system(gain: Array, step: float, latency: float = 0.0, easing: float = 0.0) -> tuple[Array, Array]:
-    """A (5, 5) and B (5,) of the module; without an easing the corrections are 0."""
+def _system(gain: Array, step: float, latency: float = 0.0, smoothing: float = 0.0) -> tuple[Array, Array]:
+    """A (5, 5) and B (5,) of the module; without `smoothing` corrections are 0."""
     a, b = np.zeros((5, 5)), np.zeros(5)
     a[:3, :3], b[:3] = (np.eye(3) - np.outer(gain, [1.0, 0.0, 0.0])) @ transition(step), gain
-    if easing > 0.0:
+    if smoothing > 0.0:
         jump = -transition(latency)[0] @ gain  # of the position that is played, per innovation, at the sample's arrival
         a[3:, :3], b[3:] = -jump * transition(step)[0], jump
-        a[3:, 3:] = math.exp(-step / easing) * np.array([[1.0, 0.0], [step / easing, 1.0]])
+        a[3:, 3:] = math.exp(-step / smoothing) * np.array([[1.0, 0.0], [step / smoothing, 1.0]])
     return a, b
 
 
@@ -67,7 +67,7 @@ def position_error(
     frequency: float = FREQUENCY,
     delay: float = 0.0,
     predicted: bool = True,
-    easing: float = CORRECTION_TIME,
+    smoothing: float = SMOOTHING,
 ) -> float:
     """Error of the position at which a texture is played (m rms), for a swipe and all its reversals.
 
@@ -81,18 +81,18 @@ def position_error(
         Behind the sensor: from an estimate to the surface, as far as it is not predicted by the device's own loop.
     predicted : bool
         False: the last sample is played as it is, without an estimator.
-    easing : float, s, >= 0
+    smoothing : float, s, >= 0
         Pole pair by which corrections are spread; 0: none.
     """
     require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
-    speed, easing = number("speed", speed, "m/s", least=0.0), number("easing", easing, "s", least=0.0)
+    speed, smoothing = number("speed", speed, "m/s", least=0.0), number("smoothing", smoothing, "s", least=0.0)
     omega, step = 2 * math.pi * number("frequency", frequency, "Hz", above=0.0), 1.0 / panel.rate
     late = panel.latency + number("delay", delay, "s", least=0.0)
     amplitude, rms = speed / omega, speed / math.sqrt(2.0)
     estimator, square, weight = panel.estimator(), 0.0, 0.0
     variance = estimator.variance + (rms * panel.jitter) ** 2
     if predicted:
-        a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, easing)
+        a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, smoothing)
         turn = np.exp(1j * omega * step)
         played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
     shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
@@ -100,7 +100,7 @@ def position_error(
         shares.append(shares[-1] * panel.dropouts)
     for (lost, share), part in product(enumerate(shares), AGES):
         age = (lost + part) / panel.rate  # of the last sample (s), beside its latency
-        u = age / easing if easing > 0.0 else 0.0
+        u = age / smoothing if smoothing > 0.0 else 0.0
         row = np.r_[transition(late + age)[0], u * math.exp(-u), math.exp(-u)]  # C(h)
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)
         bias = 0.5 * (amplitude * abs(found - np.exp(1j * omega * (late + age)))) ** 2

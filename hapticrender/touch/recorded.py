@@ -16,8 +16,8 @@ from hapticrender.checks import Validated, checked, parameter
 from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Array
 from hapticrender.touch.composed import Composable
+from hapticrender.touch.curve import Curve, strongest_carriers
 from hapticrender.touch.grating import MOST_AMPLITUDE
-from hapticrender.touch.profile import Profile, strongest_carriers
 from hapticrender.touch.tribometer import MOST_SPEED, load_swipe
 
 MOST_FRAMES = 1 << 24
@@ -26,7 +26,7 @@ MOST_RATE = 768e3  # Hz
 LOUDEST = 1e6  # times full scale
 BLOCK = 1 << 16  # frames read at once
 MOST_CARRIERS = 512
-MOST_POINTS = 1 << 24  # of a profile
+MOST_POINTS = 1 << 24  # of a curve
 WHOLE = 0.99  # of a sound file: the length that a header gives for compressed sound may be an estimate
 STREAMED = 2**31 - 2**16  # bytes: a length from here on was not known when the header was written
 _PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
@@ -51,7 +51,7 @@ def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
 class _Playback(Validated, Composable):
     """What every recording shares: scale, carriers, and how it is read.
 
-    Its profile is over recorded seconds; a spatial one is read at (position - start) / speed.
+    Its curve is over recorded seconds; a spatial one is read at (position - start) / speed.
     """
 
     amplitude: float | None = parameter(None, "m", above=0, most=MOST_AMPLITUDE)
@@ -69,21 +69,21 @@ class _Playback(Validated, Composable):
         checks.require(low < high, "passband", self.passband, "two rising frequencies in Hz")
 
     @cached_property
-    def profile(self) -> Profile:
+    def curve(self) -> Curve:
         """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
         values, step = self._recorded()
         low, high = self.passband or FELT
         if 0.5 / step <= low:
             raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
         high = min(high, 0.5 / step)
-        size = Profile.size(values.size, step, high)
+        size = Curve.size(values.size, step, high)
         if size > MOST_POINTS:
             raise SceneError(
                 f"passband = {self.passband} Hz: {values.size * step:.3g} s up to {high:g} Hz take {size} points: must "
                 f"be <= {MOST_POINTS}; shorten the recording or lower the passband"
             )
-        profile = Profile.band_limited(values, step, low, high)
-        peak = float(np.abs(profile.values).max())
+        curve = Curve.band_limited(values, step, low, high)
+        peak = float(np.abs(curve.values).max())
         if self.amplitude is None:
             scale = float(self.gain or 0.0)
             bound = f"m per unit of the file makes a peak of {scale * peak:.3g} m: must be <= {MOST_AMPLITUDE} m"
@@ -93,7 +93,7 @@ class _Playback(Validated, Composable):
             raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
         else:
             scale = self.amplitude / peak
-        return Profile(profile.values * scale, profile.step)
+        return Curve(curve.values * scale, curve.step)
 
     def _recorded(self) -> tuple[Array, float]:
         """Values of the file, and their step (s)."""
@@ -105,7 +105,7 @@ class _Playback(Validated, Composable):
 
     def _start(self) -> float:
         """Position (m) of the first value; the middle of the recording lies at the surface's by default."""
-        return -self.profile.length * (self._speed() or 0.0) / 2
+        return -self.curve.length * (self._speed() or 0.0) / 2
 
     @property
     def spatial(self) -> bool:
@@ -114,7 +114,7 @@ class _Playback(Validated, Composable):
 
     def check(self) -> None:
         """Read the file, so that a bad one is refused before anything plays."""
-        self.profile  # noqa: B018
+        self.curve  # noqa: B018
         self.bands(rate=np.inf)
 
     def bands(self, rate: float) -> Bands:
@@ -124,17 +124,17 @@ class _Playback(Validated, Composable):
         """
         if self.carriers is None:
             return Bands.none(spatial=self.spatial)
-        profile, chosen = self.profile, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
-        return _carriers(strongest_carriers(profile.values, 1 / profile.step, **chosen), self._speed(), rate)  # type: ignore[arg-type]
+        curve, chosen = self.curve, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
+        return _carriers(strongest_carriers(curve.values, 1 / curve.step, **chosen), self._speed(), rate)  # type: ignore[arg-type]
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
         speed = self._speed()
         if speed is None:
-            return self.profile.at(time)
+            return self.curve.at(time)
         touching = np.isfinite(position)
         recorded = (np.where(touching, position, 0.0) - self._start()) / speed
-        return np.where(touching, self.profile.at(recorded), 0.0)
+        return np.where(touching, self.curve.at(recorded), 0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from hapticrender.checks import Validated, parameter
 from hapticrender.protocols import Array
 from hapticrender.touch.motion_estimator import FREQUENCY, SPEED, MotionEstimator
 
-CORRECTION_TIME = 5e-3  # s: a correction of the estimate is spread by two poles of this time, so that no texture steps
+SMOOTHING = 5e-3  # s: a correction of the estimate is spread by two poles of this time, so that no texture steps
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,7 +94,7 @@ class PanelReader:
         before = self._corrected(np.array([arrival]))[0]
         self.estimator.update(arrival, sample)
         jump = before - self.estimator.at(arrival).position
-        u = (arrival - self._changed) / CORRECTION_TIME
+        u = (arrival - self._changed) / SMOOTHING
         first, second = self._correction
         # two poles in series: the jump enters both, what the first had on its way to the second stays on its way
         self._correction = np.array([first * np.exp(-u) + jump - (second + u * first) * np.exp(-u), jump])
@@ -102,6 +102,6 @@ class PanelReader:
 
     def _corrected(self, time: Array) -> Array:
         """Estimated positions (m) at `time` (s), with what is left of the last correction."""
-        u = (time - self._changed) / CORRECTION_TIME
+        u = (time - self._changed) / SMOOTHING
         first, second = self._correction
         return np.asarray(self.estimator.at(time).position + (second + u * first) * np.exp(-u))

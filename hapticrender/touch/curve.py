@@ -21,7 +21,7 @@ FAINTEST = 1e-4  # a peak below this share of the strongest one's power is no ca
 
 
 @dataclass(frozen=True)
-class Profile:
+class Curve:
     """Values at a constant step, continued past both ends by reflection, so that it never jumps."""
 
     values: Array  # (n,), n >= 2
@@ -40,7 +40,7 @@ class Profile:
         return next_fast_len(int(np.ceil(POINTS * ROLL_OFF * high * (count - 1) * step)) + 2, real=True)
 
     @classmethod
-    def band_limited(cls, values: Array, step: float, low: float, high: float) -> Profile:
+    def band_limited(cls, values: Array, step: float, low: float, high: float) -> Curve:
         """Keep `low` to `high` (Hz) of `values`, on a table fine enough for `at`.
 
         The cosine transform (DCT-I) sees exactly the reflected continuation, so
