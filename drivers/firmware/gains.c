@@ -18,7 +18,7 @@
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
 #define LIKELY REAL(9.0) /* variances: 3 sigma of a gain */
-#define HEALTHY REAL(0.5) /* of a gain about 1: one that is neither that nor a fault says that no gain has changed */
+#define HEALTHY REAL(0.35) /* of a gain about 1: one that is neither that nor a fault says that no gain has changed */
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
 #define UNEXPLAINED_INVERTED REAL(0.15)
 #define CERTAIN REAL(25.0) /* variances: 5 sigma of a gain */

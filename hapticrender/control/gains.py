@@ -31,7 +31,7 @@ SENSOR, ACTUATOR = np.arange(2)  # kinds of gains
 STATE, MOTION, RESPONSE = np.arange(3)  # models: x; p; xi_1, xi_2, xi_3, zeta_1, zeta_2, zeta_3
 LEAST_INVERTED, MOST_INVERTED = -1.6, -0.4  # gains of a sensor or an actuator that is inverted
 DEAD, MOST_GAIN = 0.25, 2.0  # of a sensor: a smaller magnitude, a larger gain is a fault
-HEALTHY = 0.5  # of a sensor's gain about 1: one that is neither that nor a fault says that the change is none of gains
+HEALTHY = 0.35  # of a sensor's gain about 1: one that is neither that nor a fault says that the change is none of gains
 LEAST_SWAPPED, MOST_SWAPPED = 0.75, 1.4  # eta; less: a drive that bears more than 2/3 of the moment of a finger
 UNEXPLAINED, UNEXPLAINED_INVERTED = 0.1, 0.15  # of the energy of e; the latter of inverted or swapped sensors
 CERTAIN, LIKELY, JUMP = 25.0, 9.0, 20.0  # variances: 5 and 3 sigma of a gain; 4.5 sigma of an innovation
@@ -192,7 +192,7 @@ def judge_gains(gains, kind, noise):
         if g * g > CERTAIN * variance and is_fault(kind, 1.0 + g, rest / energy):
             faults |= 1 << j
         elif kind == SENSOR and g * g > LIKELY * variance and abs(g) > HEALTHY:
-            other = True  # a hard press: one gain of -1 beside another of -2, or of 0.35
+            other = True  # a hard press: one gain of -1 beside another of -2, 0.35 or 0.52
     if other:
         faults = 0
     if faults == 0:
