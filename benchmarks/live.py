@@ -45,19 +45,23 @@ def entry_of(texture: hr.Texture) -> RealtimeEntry:
     return entry
 
 
-def finger_latency(calls: int) -> tuple[float, int]:
-    """Median time (s) of a call of `finger`, and samples from the call to the first one that is another."""
-    entry, spent = entry_of(TEXTURES["64 ridges"]), np.empty(calls)
-    entry.process(np.zeros((10 * BLOCK, 2)))
+def finger_latency(calls: int) -> tuple[float, int, int]:
+    """Median time (s) of a call of `finger`; samples until a new position changes the drive, and by a tenth.
+
+    A sliding finger is set 0.1 mm away, on one of two entries that are alike; a tenth of their largest difference.
+    """
+    entries, spent = [entry_of(TEXTURES["64 ridges"]) for _ in range(2)], np.empty(calls)
     for call in range(calls):
         start = time.perf_counter()
-        entry.finger(-0.02 + 1e-6 * call, 0.0, 0.4)
+        entries[0].finger(-0.02 + 1e-6 * call, 0.0, 0.4)
         spent[call] = time.perf_counter() - start
-    before = entry.samples
-    entry.finger(0.01, 0.0, 0.4)
-    entry.process(np.zeros((4 * BLOCK, 2)))
-    changed = np.flatnonzero(entry.log(before)["position"] == 0.01)[0]
-    return float(np.median(spent)), int(changed)
+    for shift in (0.0, 1e-4):
+        for entry, own in zip(entries, (0.0, shift), strict=True):
+            entry.finger(-0.02 + 0.05 * entry.samples / RATE + own, 0.05, 0.4)
+        drives = [entry.process(np.zeros((40 * BLOCK, 2))) for entry in entries]
+    change = abs(drives[0] - drives[1]).max(axis=1)
+    first, tenth = (int(np.argmax(change > share * change.max())) for share in (0.0, 0.1))
+    return float(np.median(spent)), first, tenth
 
 
 def session(finger: tuple[float, ...], place: float, phase: float) -> np.ndarray:
@@ -101,8 +105,8 @@ def main() -> None:
         print(
             f"waveform law, {name:<22}{100 * median / block:8.1f} %, 99 % of the calls below {100 * late / block:.0f} %"
         )
-    call, samples = finger_latency(calls)
-    print(f"finger(): {1e6 * call:.1f} us, then acts from sample {samples} of the next block on (a block: {BLOCK})")
+    call, first, tenth = finger_latency(calls)
+    print(f"finger(): {1e6 * call:.1f} us; another drive from sample {first} of the next block on, by a tenth {tenth}")
     runs = [session(each, place, phase) for each in FINGERS.values() for place in (0.0, 0.02) for phase in (0.0, 0.3)]
     median, worst = 100 * np.median(runs, axis=0), 100 * np.max(runs, axis=0)
     print(f"third party's plate, {len(runs)} sessions: median and worst error, under the finger / at the worse end")

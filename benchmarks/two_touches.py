@@ -12,13 +12,13 @@ from unittest.mock import patch
 
 import numpy as np
 from scipy.signal import firwin, lfilter
-from tests.two_fingers import HEAVY, LIGHT, TwoFingers
 
 import hapticrender as hr
 from hapticrender.analysis.two_touches import TouchWatch, windows_under_touch
 from hapticrender.loop import prepare, run
 from hapticrender.protocols import Array
 from tests.strangers_plate import WRONG, StrangersPlate
+from tests.test_two_touches import HEAVY, LIGHT, TwoFingers
 
 RATE = 5000.0
 SECOND, LIFT, END = 1.4, 3.0, 4.0  # s: the second finger comes, both leave, the scene ends

@@ -5,6 +5,7 @@ import doctest
 import graphlib
 import importlib
 import inspect
+import pkgutil
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import benchmarks
 import hapticrender
 from hapticrender import jit
 from hapticrender.control.kernel import error_step
@@ -360,3 +362,15 @@ def test_benchmarks_find_the_kernels_that_tests_have_cached():
     """Numba names the module that compiled a kernel: `strangers_plate` here, `tests.strangers_plate` there."""
     code = "import benchmarks.faults, strangers_plate"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_every_benchmark_finds_what_it_imports():
+    """But for packages of the extra `bench`, which it may lack here."""
+    for module in pkgutil.walk_packages(benchmarks.__path__, "benchmarks."):
+        if module.name.endswith("__main__"):
+            continue
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            if str(error.name).partition(".")[0] in ("benchmarks", "hapticrender", "tests"):
+                raise
