@@ -25,8 +25,17 @@ def slide(player, seconds, start=-0.02, speed=0.05, load=0.4, pause=0.02):
     return place
 
 
+LIES = {  # what is sensed instead, and what is named
+    "stuck": (lambda sensed: sensed * (0.0, 1.0) + (1e-5, 0.0), "sensor 1: one value repeats"),
+    "dead": (lambda sensed: 0 * sensed, "sensor 1 and 2: one value repeats"),
+    "no numbers": (lambda sensed: np.nan * sensed, "sensor 1 and 2: samples are no numbers"),
+    "inverted": (lambda sensed: -sensed, "sensor 1 and 2: the samples are suddenly -"),
+    "gain of 3": (lambda sensed: 3.0 * sensed, "sensor 1 and 2: the samples are suddenly [23]"),
+}
+
+
 class Lying(SimulatedDriver):
-    """A plate whose first sensor sticks from a moment on, or whose cable is pulled."""
+    """A plate whose sensors lie from a moment on, or whose cable is pulled."""
 
     def __init__(self, at, what):
         super().__init__(Plate(PlateParameters(), hr.Finger.absent()))
@@ -39,8 +48,8 @@ class Lying(SimulatedDriver):
         if self.count > self.at * self.rate:
             if self.what == "unplugged" and self.count < self.at * self.rate + 10:
                 raise hr.DeviceLost("plate: play: no answer")
-            if self.what == "stuck":
-                sensed.sensed[:, 0] = 1e-5
+            if self.what in LIES:
+                sensed = sensed._replace(sensed=LIES[self.what][0](sensed.sensed))
             if self.what == "cut" and self.count < self.at * self.rate + 2:
                 return sensed._replace(sensed=sensed.sensed[:, :1])
         return sensed

@@ -140,7 +140,7 @@ def test_what_was_found_goes_on_and_only_bands_are_new(change, rng):
 def test_a_stop_stays_a_stop(change, rng):
     entry, _, second = change
     entry.process(quiet(rng, 0.1))
-    entry.process(np.full((200, 2), np.nan))  # 40 ms; 18 ms of it are a fault
+    entry.process(np.full((200, 2), np.nan))  # 40 ms; 7 ms of it are a fault
     entry.play(SampledTexture(grating(frequency=80.0), RATE), second)
     assert abs(entry.process(quiet(rng, 0.2))).max() == 0.0
     assert entry.running is second

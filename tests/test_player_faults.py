@@ -10,7 +10,7 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from live_devices import RIDGES, TONE, Calling, Lying
+from live_devices import LIES, RIDGES, TONE, Calling, Lying
 
 import hapticrender as hr
 import hapticrender.player
@@ -88,17 +88,20 @@ def test_a_recording_says_that_an_error_ended_it(tmp_path):
     assert not (cut.flags[:-1] & hr.Flag.STOPPED).any()
 
 
-def test_a_sensor_that_sticks_stops_the_drive_and_is_an_error_at_the_next_call(tmp_path):
-    driver = Lying(0.5, "stuck")
-    with hr.Player(driver=driver) as player:
-        player.play(RIDGES)
+@pytest.mark.parametrize("lie", LIES)
+def test_sensors_that_lie_stop_the_drive_and_are_an_error_at_the_next_call(lie, tmp_path):
+    """Zero drive within 10 ms of the fault."""
+    driver = Lying(0.5, lie)
+    with hr.Player(driver=driver, paced=False) as player:
+        player.play(hr.Grating(frequency=100.0, amplitude=50e-6))
         player.record(tmp_path / "fault.au")
-        with pytest.raises(hr.DeviceFault, match="sensor 1: one value repeats"):
-            go_on(player)
-    drive = np.concatenate(driver.played)
-    assert abs(drive[-10:]).max() == 0.0
+        with pytest.raises(hr.DeviceFault, match=LIES[lie][1]):
+            player.sleep(1.0)
+    drive, at = np.concatenate(driver.played), round(0.5 * driver.rate)
+    assert abs(drive[at - 50 : at]).max() > 0.1
+    assert not drive[at + round(0.01 * driver.rate) :].any()
     stopped = np.flatnonzero(Recording.load(tmp_path / "fault.au").flags & hr.Flag.STOPPED)
-    assert stopped[0] / 5000.0 < 0.55
+    assert at < stopped[0] < at + round(0.008 * driver.rate)
 
 
 def test_a_device_that_is_unplugged_is_an_error_at_the_next_call():

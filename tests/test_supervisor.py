@@ -49,22 +49,22 @@ def noise(plate, sensed):
 
 
 FAULTS = {  # what is sensed instead: bounds of time (s) and motion (m), and what is named
-    "frozen": (lambda plate, sensed: plate.held, 10e-3, 250e-6, "sensor 1 and 2: one value repeats"),
-    "dead": (lambda plate, sensed: 0 * sensed, 10e-3, 250e-6, "sensor 1 and 2: one value repeats"),
-    "one dead": (lambda plate, sensed: sensed * (1.0, 0.0), 10e-3, 250e-6, "sensor 2: one value repeats"),
-    "at its range": (lambda plate, sensed: 0 * sensed + 1e-3, 20e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
-    "NaN": (lambda plate, sensed: np.nan * sensed, 20e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
-    "noisy": (noise, 10e-3, 250e-6, "sensor 1 and 2: the samples are suddenly"),
+    "frozen": (lambda plate, sensed: plate.held, 8e-3, 250e-6, "sensor 1 and 2: one value repeats"),
+    "dead": (lambda plate, sensed: 0 * sensed, 8e-3, 250e-6, "sensor 1 and 2: one value repeats"),
+    "one dead": (lambda plate, sensed: sensed * (1.0, 0.0), 8e-3, 250e-6, "sensor 2: one value repeats"),
+    "at its range": (lambda plate, sensed: 0 * sensed + 1e-3, 8e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
+    "NaN": (lambda plate, sensed: np.nan * sensed, 8e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
+    "noisy": (noise, 8e-3, 250e-6, "sensor 1 and 2: the samples are suddenly"),
 }
 
 
-def assert_stopped(plate, frequency, named, latest, most, fade):
-    """A tone stops within `latest` (s) and `most` (m) for the cause that is named; zero drive after a fade (s)."""
+def assert_stopped(plate, frequency, named, latest, most):
+    """A tone stops within `latest` (s) and `most` (m) for the cause that is named; zero drive 2 ms later."""
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
         hr.render(scene(frequency), driver=plate)
     assert 0 < stopped.value.time - START < latest
     assert max(plate.motion) < most
-    drive, quiet = np.concatenate(plate.played), round((stopped.value.time + fade) * RATE) + 2
+    drive, quiet = np.concatenate(plate.played), round((stopped.value.time + 2e-3) * RATE) + 2
     assert len(drive) >= quiet
     assert not drive[quiet:].any()
 
@@ -73,20 +73,20 @@ def assert_stopped(plate, frequency, named, latest, most, fade):
 @pytest.mark.parametrize("frequency", [72.0, 189.0])
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_sensor_that_lies_stops_the_drive_and_is_named(fault, frequency, truth):
-    """Found: 2 to 18 ms and 140 um at most."""
+    """Zero drive within 10 ms of the fault: 2 ms are the fade."""
     change, latest, most, named = FAULTS[fault]
     plate = Watched(change, **truth)
-    assert_stopped(plate, frequency, named, latest, most, 10e-3)
+    assert_stopped(plate, frequency, named, latest, most)
     assert not plate.is_open
 
 
 @pytest.mark.parametrize("truth", [{}, FINGER], ids=["free", "touched"])
 def test_the_texture_goes_on_with_every_second_sample(truth):
-    """Until test 1 stops it, after 46 ms; the damper's past had gaps once, and moved the plate by 1.3 mm."""
+    """Until test 1 stops it, after 18 ms; the damper's past had gaps once, and moved the plate by 1.3 mm."""
     plate = Watched(lambda plate, sensed: sensed * (1.0 if len(plate.played) % 2 else np.nan), **truth)
     with pytest.raises(hr.DeviceFault, match="sensor 1 and 2: samples are no numbers") as stopped:
         hr.render(scene(20.0), driver=plate)
-    assert 40e-3 < stopped.value.time - START < 50e-3
+    assert 15e-3 < stopped.value.time - START < 20e-3
     first = round(START * RATE)
     assert max(plate.motion[first:]) < 1.01 * max(plate.motion[first - 1000 : first])  # four periods
 
@@ -97,7 +97,7 @@ def test_the_journal_of_a_stopped_run_is_whole_and_flagged(tmp_path):
         hr.render(scene(), driver=plate, journal=tmp_path / "run.au")
     recording = hr.Recording.load(tmp_path / "run.au")
     played = np.concatenate(plate.played)
-    assert len(recording) >= (stopped.value.time + 10e-3) * RATE
+    assert len(recording) >= (stopped.value.time + 2e-3) * RATE
     np.testing.assert_array_equal(recording.drive, played[: len(recording)])
     assert not played[len(recording) :].any()  # the loop's own zeros
     first = np.flatnonzero(recording.flags & hr.Flag.STOPPED)[0]
@@ -113,7 +113,7 @@ def test_a_compiled_loop_stops_too():
         hr.render(scene(72.0, simulation=lying))
     assert stopped.value.time < 0.2
     drive = stopped.value.recording.drive
-    assert not drive[round((stopped.value.time + 10e-3) * RATE) + 2 :].any()
+    assert not drive[round((stopped.value.time + 2e-3) * RATE) + 2 :].any()
     assert abs(drive).max() < 1.0
 
 
@@ -151,9 +151,9 @@ TUNED = pytest.mark.parametrize(
 @TUNED
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, frequency, truth):
-    """With the fade of 2 ms, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.7 mm."""
+    """With the fade, zero drive within 10 ms where a sensor changes; an inverted coil moves up to 0.7 mm."""
     sensors, coils, latest, most, named = CHANGES[change]
-    assert_stopped(Rewired(sensors, coils, **truth), frequency, named, latest, most, 2e-3)
+    assert_stopped(Rewired(sensors, coils, **truth), frequency, named, latest, most)
 
 
 @pytest.mark.parametrize(
@@ -245,9 +245,9 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
     assert np.ptp(motion) / 2 == pytest.approx(50e-6, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [*range(1000, 1006), 10041, 10099, 41691, 60789])
+@pytest.mark.parametrize("seed", [*range(1000, 1006), 10041, 10099, 41691, 60789, 61279])
 def test_normal_scenes_are_not_stopped(seed):
-    """20 s each (`benchmarks/false_stops.py`: hours); the last four slide at 4 and 5 N, or press 4.6 N within 3 ms."""
+    """20 s each (`benchmarks/false_stops.py`: hours); the last ones slide at 4 and 5 N, or press 4.6 N within 3 ms."""
     error, controller = run(*random_scene(seed))
     assert error is None
     assert controller.damper_scale == 1.0

@@ -179,8 +179,8 @@ static void judge_energies(const supervisor_t *s, uint32_t *wrong, uint32_t *act
     }
 }
 
-/* Tests 3, 4 and 7: whether the motion follows from the drive; `danger` is raised where it is large. */
-static supervisor_cause_t check_motion(supervisor_t *s, uint32_t *danger)
+/* Tests 3, 4 and 7: whether the motion follows from the drive. */
+static supervisor_cause_t check_motion(supervisor_t *s)
 {
     const supervision_t *p = s->p;
     const real_t last[2] = {s->filter.value[2], s->filter.value[3]};
@@ -189,7 +189,7 @@ static supervisor_cause_t check_motion(supervisor_t *s, uint32_t *danger)
     uint32_t grows = 0u;
     filter_signals(s);
     const real_t motion = real_abs(s->filter.value[0]) + p->lever * real_abs(s->filter.value[1]);
-    *danger |= (motion > p->danger_motion) ? 1u : 0u;
+    const uint32_t danger = ((s->peak > p->danger_drive) || (motion > p->danger_motion)) ? 1u : 0u;
     for (uint32_t i = 0u; i < 2u; i++) {
         const real_t residual = update_energies(s, i, s->filter.value[2u + i] - last[i]);
         if (i == 0u) {
@@ -198,11 +198,11 @@ static supervisor_cause_t check_motion(supervisor_t *s, uint32_t *danger)
     }
     judge_energies(s, &wrong, &active);
     if (wrong != 0u) {
-        s->inconsistent_count += (*danger != 0u) ? 4u : 1u;
+        s->inconsistent_count += (danger != 0u) ? 4u : 1u;
     } else {
         s->inconsistent_count = less_one(less_one(s->inconsistent_count));
     }
-    s->active_count = counted(s->active_count, active & *danger);
+    s->active_count = counted(s->active_count, active & danger);
     s->motion_count = counted(s->motion_count, (motion > p->most_motion) ? 1u : 0u);
     if (s->motion_count >= MOTION_SAMPLES) {
         return SUPERVISOR_OVERMOTION;
@@ -314,9 +314,8 @@ static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t caus
     return (found.sensors != 0u) ? SUPERVISOR_SENSOR_GAIN : SUPERVISOR_ACTUATOR_GAIN;
 }
 
-/* All tests of a sample; returns what failed first, and whether there is danger. */
-static supervisor_cause_t check(
-    supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[], uint32_t *danger)
+/* All tests of a sample; returns what failed first. */
+static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[])
 {
     supervisor_cause_t cause = check_sensors(s, sensed, s->forces[s->at][2]);
     if ((check_drive(s, drive) != 0u) && (cause == SUPERVISOR_FINE)) {
@@ -335,8 +334,7 @@ static supervisor_cause_t check(
         }
         s->started = 1u;
     }
-    *danger = (s->peak > s->p->danger_drive) ? 1u : 0u;
-    const supervisor_cause_t found = check_motion(s, danger);
+    const supervisor_cause_t found = check_motion(s);
     cause = ((cause == SUPERVISOR_FINE) || (found == SUPERVISOR_OVERMOTION)) ? found : cause;
     if ((s->p->damped != 0u) && (check_ringing(s, law) != 0u) && (cause == SUPERVISOR_FINE)) {
         cause = SUPERVISOR_RINGING;
@@ -347,21 +345,12 @@ static supervisor_cause_t check(
     return cause;
 }
 
-static void fade_out(supervisor_t *s, supervisor_cause_t cause, uint32_t danger)
-{
-    real_t step = ((danger != 0u) || (s->cause >= SUPERVISOR_SENSOR_GAIN)) ? s->p->fade_danger : s->p->fade_out;
-    step = (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : step;
-    s->fade_step = real_max(s->fade_step, step);
-    s->fade = real_max(s->fade - s->fade_step, REAL(0.0));
-}
-
 uint32_t supervisor_step(
     supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference,
     real_t drive[])
 {
     supervisor_t *s = supervisor;
     uint32_t flags = 0u;
-    uint32_t danger = 0u;
     (void)memset(drive, 0, LAW_CHANNELS * sizeof(drive[0]));
     if (s->fade > REAL(0.0)) {
         flags = law_step(law, sensed, position, velocity, reference, drive);
@@ -371,10 +360,11 @@ uint32_t supervisor_step(
         s->input[2u + i] = REAL(0.5) * (s->force[i] + s->forces[s->at][i]);
         s->force[i] = s->forces[s->at][i];
     }
-    const supervisor_cause_t cause = check(s, law, sensed, drive, &danger);
+    const supervisor_cause_t cause = check(s, law, sensed, drive);
     s->cause = (s->cause == SUPERVISOR_FINE) ? cause : s->cause;
     if (s->cause != SUPERVISOR_FINE) {
-        fade_out(s, cause, danger);
+        s->fade_step = real_max(s->fade_step, (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : s->p->fade_out);
+        s->fade = real_max(s->fade - s->fade_step, REAL(0.0));
         flags |= SUPERVISOR_STOPPED;
     }
     if (s->p->heat_pole > REAL(0.0)) {

@@ -31,7 +31,7 @@ typedef enum {
 typedef struct {
     real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
     real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
-    real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_danger, fade_now;
+    real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_now;
     uint32_t frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time, ring_stop_time;
     uint32_t suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */

@@ -34,8 +34,8 @@ from hapticrender.control.supervisor_kernel import (
 from hapticrender.jit import Addressed, CFunction
 from hapticrender.protocols import Array, Controller
 
-FADE_OUT, FADE_DANGER, FADE_NOW = 10e-3, 2e-3, 0.2e-3  # s
-INVALID_TIME = 50e-3  # s
+FADE_OUT, FADE_NOW = 2e-3, 0.2e-3  # s
+INVALID_TIME = 20e-3  # s: samples that are all invalid stop the drive after 7.1 ms
 FROZEN_SAMPLES, FROZEN_TIME = 10, 2e-3  # s; noise of 1 um in steps of 0.12 um repeats a sample with p = 0.034
 FROZEN_SIGMAS = 4 * 1.3  # of the noise: the drive must have moved the sensor by so much
 LEAST_NOISE = 1e-4  # of a sensor's range: a model may state no noise, and no steps
@@ -231,7 +231,8 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "invalid_pole": _pole(INVALID_TIME, rate),
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
-        **{f"fade_{name}": min(model.pace / (time * rate), 1.0) for name, time in FADES.items()},
+        "fade_out": min(model.pace / (FADE_OUT * rate), 1.0),
+        "fade_now": min(model.pace / (FADE_NOW * rate), 1.0),
         **_limit_settings(controller, model),
     }
     if demand is None:
@@ -307,9 +308,6 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "slow_time": SLOW_TIME * rate,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
-
-
-FADES = {"out": FADE_OUT, "danger": FADE_DANGER, "now": FADE_NOW}  # s
 
 
 def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, Any]:

@@ -8,7 +8,7 @@ one-pole means of squares.
 === ============ ================================================================================ ====================
 no  cause        condition                                                                        for
 === ============ ================================================================================ ====================
-1   invalid      share of samples that are not finite or not inside the range > 0.3               50 ms (mean)
+1   invalid      share of samples that are not finite or not inside the range > 0.3               20 ms (mean)
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves                                         at once
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
@@ -27,8 +27,8 @@ no  cause        condition                                                      
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
 static displacement under 5 N.  *Danger* is a motion > 4 R + 1.36 sag or a drive above 0.9 of its limit.  The drive
-fades out in 10 ms, in danger and after tests 9 to 11 in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing
-damper is turned down to 0.4, then to 0; the drive stops where it rings all the same for 150 ms.
+fades out in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper is turned down to 0.4, then to 0; the
+drive stops where it rings all the same for 150 ms.
 
 Tests 3 to 5, 7 and 9 to 11 need a `Demand`, 9 to 11 at most two sensors and actuators; 6 a controller with an inner
 damper; 8 a limit.  Without them a controller has tests 1 and 2.  Causes have these numbers.  `limit_rms_drive` holds
@@ -64,7 +64,7 @@ _SETTINGS = """
 sensor_limit invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole
 ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
 sensed_bound drive_limit heat_pole heat_gain slow_pole
-fade_out fade_danger fade_now
+fade_out fade_now
 """.split()
 _TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
@@ -182,14 +182,14 @@ def check_growth(supervisor, residual):
 
 
 @kernel
-def check_motion(supervisor, drive_in_danger):
-    """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause and whether there is danger."""
+def check_motion(supervisor):
+    """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause, or 0."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, e, value, rate, change = s.p, s.energy, s.value, s.rate, s.change
     last0, last1 = value[2], value[3]
     filter_signals(supervisor)
     s.motion = abs(value[0]) + p.lever * abs(value[1])
-    danger = drive_in_danger or s.motion > p.danger_motion
+    danger = s.peak > p.danger_drive or s.motion > p.danger_motion
     wrong, active, grows = False, False, False
     mass, damping, stiffness, bounds = p.mass, p.damping, p.stiffness, p.bound
     for i in range(2):
@@ -214,10 +214,10 @@ def check_motion(supervisor, drive_in_danger):
     s.active_count = s.active_count + 1 if active and danger else 0
     s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
     if s.motion_count >= 5:
-        return OVERMOTION, danger
+        return OVERMOTION
     if s.active_count >= p.active_time or grows:
-        return ACTIVE, danger
-    return INCONSISTENT if s.inconsistent_count >= p.inconsistent_time else 0, danger
+        return ACTIVE
+    return INCONSISTENT if s.inconsistent_count >= p.inconsistent_time else 0
 
 
 @kernel
@@ -314,14 +314,14 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
     acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
     s.position = position[n]
-    cause, danger = check_sensors(supervisor, sensed, n, forces[now, 2], acts), False
+    cause = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
     if p.modelled > 0:
         if s.compared == 0:  # a steady load is no motion
             for i in range(2):
                 s.low[i] = s.high[i] = s.input[i]
-        found, danger = check_motion(supervisor, s.peak > p.danger_drive)
+        found = check_motion(supervisor)
         cause = found if cause == 0 or found == OVERMOTION else cause
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
@@ -335,9 +335,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     if cause != 0 and s.cause == 0:
         s.cause, s.stopped = cause, s.sample
     if s.cause != 0:
-        quick = danger or s.cause >= SENSOR_GAIN
-        step = p.fade_now if cause == OVERMOTION else p.fade_danger if quick else p.fade_out
-        s.fade_step = max(s.fade_step, step)
+        s.fade_step = max(s.fade_step, p.fade_now if cause == OVERMOTION else p.fade_out)
         s.fade = max(s.fade - s.fade_step, 0.0)
         flags[n] |= STOPPED
     if p.heat_pole > 0.0:
