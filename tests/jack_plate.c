@@ -4,6 +4,7 @@
  * noise in full scales, then A, B, C and D row by row.  Ports are in_1.. and out_1..  Commands on standard input:
  *   run N     go through N periods as fast as all clients can (freewheel)
  *   stall MS  sleep once inside a period: the server reports an overrun
+ *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
  *   count     print periods, overruns that JACK reported, and the time of the server in frames
  *   save FILE write what was recorded: float32, outputs without noise, then with it, a row a sample
  * The end of standard input ends it.
@@ -21,7 +22,7 @@ enum { MOST = 64 };
 
 static int states, inputs, outputs;
 static long length, recorded;
-static double noise, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
+static double noise, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
 static float *record;
 static jack_client_t *client;
 static jack_port_t *in_port[MOST], *out_port[MOST];
@@ -67,7 +68,8 @@ static int process(jack_nframes_t frames, void *unused) {
         double u[MOST], y[MOST];
         for (int i = 0; i < inputs; i++) u[i] = in[i][n];
         sample(u, y);
-        for (int i = 0; i < outputs; i++) out[i][n] = (float)(y[i] + noise * gauss());
+        if (y[0] > above) gain = next_gain;
+        for (int i = 0; i < outputs; i++) out[i][n] = (float)(gain * (y[i] + noise * gauss()));
         if (recorded < length) {
             for (int i = 0; i < outputs; i++) {
                 record[2 * outputs * recorded + i] = (float)y[i];
@@ -124,6 +126,7 @@ static void run(long count) {
 static void obey(char *line) {
     long number = 0;
     char name[4096];
+    sscanf(line, "gain %lf %lf", &next_gain, &above);
     if (sscanf(line, "run %ld", &number) == 1) run(number);
     if (sscanf(line, "stall %ld", &number) == 1) atomic_store(&stall, number);
     if (sscanf(line, "save %4095[^\n]", name) == 1) save(name);

@@ -355,6 +355,27 @@ def test_textures_change_under_the_callback(connected, tmp_path):
     assert abs(phasor(motion[end - round(RATE / 2) : end], 180.0, RATE)) == pytest.approx(2.5e-6, rel=0.02)
 
 
+@pytest.mark.parametrize(("gain", "named"), [(0.0, "one value repeats"), (-1.0, "the samples are suddenly -")])
+def test_a_plate_whose_sensors_die_or_are_inverted_is_left_at_zero_drive(connected, tmp_path, gain, named):
+    """Within 10 ms, in the callback; from a sample of more than 40 um on, that becomes 0 or another sign."""
+    device = connected(jack_ring.plate(), length=round(60 * RATE), noise=NOISE / METRES)
+    with hr.Player("vt-plate", jack_ring.driver(), profile={"rate": RATE}) as player:
+        player.finger(0.01, 0.0, 0.8)
+        player.play(hr.Grating(frequency=100.0, amplitude=50e-6))
+        player.record(tmp_path / "fault.au")
+        device.say("run 700")
+        device.say(f"gain {gain:g} {40e-6 / METRES}")
+        device.say("run 100")
+        with pytest.raises(hr.DeviceFault, match=named):
+            player.sleep(1.0)
+    recording = hr.Recording.load(tmp_path / "fault.au")
+    jumped = abs(np.diff(recording.sensed.mean(axis=1))) > 20e-6  # at 100 Hz a sample is 0.7 um
+    first = int(np.argmax(jumped)) + 1
+    assert recording.flags[first - 1] == 0
+    assert abs(recording.drive[first - 960 : first]).max() > 0.05
+    assert not recording.drive[first + round(0.01 * RATE) :].any()
+
+
 def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
     """At most 0.3 % of the callbacks; one in Python loses about two thirds of them.
 
