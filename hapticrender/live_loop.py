@@ -295,7 +295,7 @@ def band_figures(bands: Bands, first: int, rate: float, signals: dict[str, Array
     frequency is 0.
     """
     reference, motion = signals["reference"], signals["motion"][:, 0]
-    if not len(reference) or not np.isfinite(motion).all():
+    if not len(reference):
         return []
     time, position = (first + np.arange(len(reference))) / rate, signals["position"]
     reference, motion = reference - reference.mean(), motion - motion.mean()

@@ -10,7 +10,10 @@ from hapticrender.protocols import Flag
 
 @dataclass(frozen=True)
 class BandState:
-    """What a band does: its frequency (Hz), target and achieved amplitude, and |achieved - target|/|target|."""
+    """What a band does: its frequency (Hz), target and achieved amplitude, and |achieved - target|/|target|.
+
+    The latter are NaN where no motion is sensed.
+    """
 
     frequency: float
     target: float
@@ -38,8 +41,8 @@ class PlayerState:
         lines = []
         for band in self.bands:
             label = f"{band.frequency:7.1f} Hz" if band.frequency > 0.0 else "  rms of all"
+            achieved = "not sensed" if math.isnan(band.achieved) else f"achieved {band.achieved:9.3g} {self.unit}"
             error = "  -" if math.isnan(band.error) else f"{100 * band.error:6.2f} %"
-            figures = f"target {band.target:9.3g} {self.unit}  achieved {band.achieved:9.3g} {self.unit}"
-            lines.append(f"{label}  {figures}  error {error}")
+            lines.append(f"{label}  target {band.target:9.3g} {self.unit}  {achieved}  error {error}")
         load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
         return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])

@@ -106,7 +106,10 @@ def test_a_recording_says_where_its_motion_comes_from(source, tmp_path):
         player.record(tmp_path / "live.au")
         assert (tmp_path / "live.au").exists()
         player.sleep(0.5)
+        state = player.state()
         recording = player.end_recording()
+    assert state.bands[0].target == pytest.approx(5e-6, rel=1e-3)
+    assert ("not sensed" in str(state)) == (source == "unknown")
     assert recording.header.motion_source == source
     judged = recording.summary()["verdict"] != "not judged"
     assert judged == (source == "true")  # 1 um of noise on 5 um is no error of the device
