@@ -23,12 +23,13 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.driver_checks import check_channels
 from hapticrender.mathx import on_time, smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.hybrid import PLACES, HybridPlant
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed
-from hapticrender.renderers.base import BaseRenderer, check_channels
+from hapticrender.renderers.base import BaseRenderer
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
 from hapticrender.renderers.limits import check_carriers, perceptible

@@ -18,7 +18,7 @@ from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import check_channels, check_tables, read_devices
+from hapticrender.renderers.base import check_tables, read_devices
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.renderers.shaped import Port
@@ -66,7 +66,6 @@ class UltrasonicRenderer(FrictionRenderer):
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
-        check_channels(driver, {1: ""}, {0: "", 1: ""})
         assumed, load = setup.assumed, setup.load
         model = _model(setup, driver)
         whole = assumed.friction_coefficient * load

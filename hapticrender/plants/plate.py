@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
-SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2 per heave and rocking
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2, and their currents, by heave and rocking
 EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1.1-1.4 kHz, either sign
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
