@@ -26,7 +26,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.mathx import on_time, smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.plants.hybrid import PLACES, HybridPlant
+from hapticrender.plants.hybrid import COILS, PLACES, SENSORS, HybridPlant
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed
 from hapticrender.renderers.base import BaseRenderer
@@ -39,7 +39,6 @@ from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene, scene_keys
 
 BOTH = "rate"  # the parameter that plate and screen share
-COILS = SENSORS = 2  # channels of the plate, which come first
 
 
 @dataclass(frozen=True, kw_only=True)

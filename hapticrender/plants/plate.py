@@ -19,7 +19,7 @@ from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
 from hapticrender.mathx import state_space, zoh
-from hapticrender.plants.compiled import CompiledPlant
+from hapticrender.plants.compiled import CompiledPlant, resolution
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
@@ -90,15 +90,8 @@ class PlateParameters(Validated):
         """Coil current per command voltage (A/V): (1 - R2/Rp)/R1, about -1/5."""
         return (1 - self.amplifier_r2 / self.amplifier_rp) / self.amplifier_r1
 
-    @property
-    def current_step(self) -> float:
-        """Resolution of the coil current (A); 0 is ideal."""
-        return 2 * self.current_limit / 2**self.current_bits if self.current_bits else 0.0
-
-    @property
-    def sensor_step(self) -> float:
-        """Resolution of a sensor (m); 0 is ideal."""
-        return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
+    current_step = resolution("current_bits", "current_limit", 2.0, "the coil current (A)")
+    sensor_step = resolution("sensor_bits", "sensor_range", 1.0, "a sensor (m)")
 
     @property
     def mass_matrix(self) -> Array:
