@@ -33,7 +33,6 @@ EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
 FREE_FREE = 2.365020372431352  # half of the first root of cos(x) cosh(x) = 1: the first even mode of a free bar
-NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: gain of the default parts, by which a drive in A becomes volts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +54,6 @@ class PlateParameters(Validated):
     force_constant: float = parameter(7.4, "N/A", "of each coil", above=0.0)
     coil_spacing: float = parameter(55e-3, "m", "distance between the coils", above=0.0)
     glass_length: float = parameter(110e-3, "m", "the sensors sit at its ends", above=0.0)
-    amplifier_r1: float = parameter(10e3, "ohm", "R1; the drive is the current that the default parts give", above=0.0)
-    amplifier_r2: float = parameter(2e3, "ohm", "R2; i = V/R1 (1 - R2/Rp)", above=0.0)
-    amplifier_rp: float = parameter(1.0, "ohm", "Rp", above=0.0)
     current_limit: float = parameter(3.0, "A", "of each coil", above=0.0)
     current_bits: int = parameter(12, about="resolution over +- current_limit, 0 is ideal", most=24)
     sensor_range: float = parameter(2e-3, "m", "full range of a sensor", above=0.0)
@@ -84,11 +80,6 @@ class PlateParameters(Validated):
     def half_spacing(self) -> float:
         """Half the coil spacing a (m)."""
         return self.coil_spacing / 2
-
-    @property
-    def amplifier_gain(self) -> float:
-        """Coil current per command voltage (A/V): (1 - R2/Rp)/R1, about -1/5."""
-        return (1 - self.amplifier_r2 / self.amplifier_rp) / self.amplifier_r1
 
     current_step = resolution("current_bits", "current_limit", 2.0, "the coil current (A)")
     sensor_step = resolution("sensor_bits", "sensor_range", 1.0, "a sensor (m)")
@@ -283,7 +274,6 @@ def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Arra
         lever_per_metre=1.0 / p.half_spacing,
         reach=p.glass_length / p.coil_spacing,
         nodes_per_lever=(NODES - 1) / (2.0 * (p.glass_length / p.coil_spacing)),
-        amplifier=p.amplifier_gain / NOMINAL_AMPLIFIER,
         sensor_limit=p.sensor_range / 2,
         sensor_gain=(p.sensor_gain_1, p.sensor_gain_2),
         **{name: function.address for name, function in FUNCTIONS.items()},
