@@ -128,15 +128,9 @@ class HybridRenderer(BaseRenderer):
                 require(found == needed, f"{table}.{name}", found, f"{needed} on a hybrid")
         rate = of_screen.assumed.rate if driver is None else driver.rate
         bands = _share_out(scene, settings, of_plate.assumed, rate)
-        return HybridSetup(
-            scene,
-            settings,
-            velocity_per_force,
-            bands,
-            replace(of_plate, scene=_part(plate, bands.plate)),
-            of_screen,
-            replace(of_screen, scene=_part(screen, bands.friction)) if len(bands.friction) else None,
-        )
+        of_plate = replace(of_plate, scene=_part(plate, bands.plate))
+        friction = replace(of_screen, scene=_part(screen, bands.friction)) if len(bands.friction) else None
+        return HybridSetup(scene, settings, velocity_per_force, bands, of_plate, of_screen, friction)
 
     def plant(self, setup: HybridSetup, seed: int) -> HybridPlant:
         """Return the simulated device with the scene's finger on it."""

@@ -212,13 +212,7 @@ class Encoder(MotionEstimator):
     '3.960 mm, 40.00 mm/s'
     """
 
-    def __init__(
-        self,
-        resolution: float,
-        bits: int = 32,
-        origin: float = 0.0,
-        **motion: float,
-    ) -> None:
+    def __init__(self, resolution: float, bits: int = 32, origin: float = 0.0, **motion: float) -> None:
         step = checks.number("resolution", resolution, "m")
         checks.require(step != 0.0, "resolution", resolution, "the metres of a count, not 0")
         super().__init__(resolution=abs(step), **motion)
