@@ -166,9 +166,8 @@ class AudioDriver(BaseDriver):
         if not channels:
             return None
         card = find(self.device[output] if isinstance(self.device, tuple) else self.device)
-        present, own, kind = (
-            (card.outputs, card.output_latency, "outputs") if output else (card.inputs, card.input_latency, "inputs")
-        )
+        kind = "outputs" if output else "inputs"
+        present, own = (card.outputs, card.output_latency) if output else (card.inputs, card.input_latency)
         if max(channels) > present:
             raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
         latency = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
@@ -299,8 +298,7 @@ class AudioDriver(BaseDriver):
 def _channels(name: str, given: Any) -> Channels:
     """Check channel numbers as they are printed on the card, from 1 on."""
     channels = tuple(given)
-    if any(not isinstance(each, int | np.integer) or each < 1 for each in channels) or len(set(channels)) < len(
-        channels
-    ):
+    whole = all(isinstance(each, int | np.integer) and each >= 1 for each in channels)
+    if not whole or len(set(channels)) < len(channels):
         raise ValueError(f"{name}={given!r}: must be different whole numbers >= 1")
     return tuple(int(each) for each in channels)

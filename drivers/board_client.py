@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import integer, number
+from hapticrender.checks import integer, number, require
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
@@ -284,8 +284,7 @@ class BoardClient(OpenedInWith):
         One row for every `stream` samples, from the first one of the multisine on; the drive fades in and out within
         10 ms.  Rows that were lost on the line repeat the one before.
         """
-        if not lines:
-            raise ValueError("lines = []: must be 1 or more")
+        require(len(lines) > 0, "lines", lines, "1 or more")
         samples = round(duration * self.capabilities.rate)
         first = self._steadily(lambda line: line.identify(lines, samples, stride=stream))
         self._runs, self._rows = True, Rows(first, stream)

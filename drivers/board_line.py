@@ -92,10 +92,7 @@ class BoardLine:
             self._port = connect(port, baud)
         except (OSError, ValueError) as error:
             raise DeviceNotFound(f"{port}: open: {error}") from error
-        self._nonce, self.session = (
-            secrets.randbelow(2**32 - 1) + 1,
-            0,
-        )  # sets it apart from earlier ones; 0: not greeted
+        self._nonce, self.session = secrets.randbelow(2**32 - 1) + 1, 0  # apart from earlier ones; 0: not greeted
         self.telemetry: Telemetry | None = None
         self.streamed: deque[Stream] = deque(maxlen=MOST_STREAM)
         self.finger: Finger | None = None  # not sent yet
@@ -145,8 +142,7 @@ class BoardLine:
             if done():
                 return
             if self.clock.monotonic() >= end:
-                text = f"{self.port}: {operation}: no answer in {self.timeout:g} s ({self._carried()})"
-                raise DeviceTimeout(text)
+                raise DeviceTimeout(f"{self.port}: {operation}: no answer in {self.timeout:g} s ({self._carried()})")
             self.clock.sleep(PAUSE)
 
     def command(self, kind: Kind, *fields: float) -> Request:

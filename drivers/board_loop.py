@@ -74,21 +74,13 @@ class BoardLoop:
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""
-        drive, sensed, position, load, reference, flags = self.driver.columns(self._client.rows())
-        first, self.samples = self.samples, self.samples + len(flags)
-        motion = sensed @ self.model.place_from_sensed.T
-        recent = np.vstack([self._recent, np.stack([reference, motion[:, 0], position], axis=1)])
+        found = self.driver.signals(self._client.rows())
+        first, count = self.samples, len(found["flags"])
+        self.samples += count
+        motion = found["sensed"] @ self.model.place_from_sensed.T
+        recent = np.vstack([self._recent, np.stack([found["reference"], motion[:, 0], found["position"]], axis=1)])
         self._recent = recent[-round(JUDGED * self.driver.rate) :]
-        return first, {
-            "drive": drive,
-            "sensed": sensed,
-            "motion": motion,
-            "position": position,
-            "normal_load": load,
-            "reference": reference,
-            "target": np.zeros((len(flags), 0), complex),
-            "flags": flags,
-        }
+        return first, {**found, "motion": motion, "target": np.zeros((count, 0), complex)}
 
     def figures(self) -> list[tuple[float, float, float, float]]:
         """Return frequency (Hz), target, achieved (m) and relative error of every band, from the latest telemetry.

@@ -110,11 +110,12 @@ class SerialDriver(BaseDriver):
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
                 self._begin(bands, texture)
-            drive, sensed, position, load, _, flags = self.columns(self.client.rows(count, self._point))
+            found = self.signals(self.client.rows(count, self._point))
             envelope = np.zeros(0) if bands.envelope is None else bands.envelope
             target = np.tile(np.asarray(envelope, complex), (count, 1))
-            target[np.isnan(position)[:, None] & (bands.wavenumber > 0.0)] = 0.0
-            return drive, target, flags, Sensed(sensed, position=position, normal_load=load, flags=flags)
+            target[np.isnan(found["position"])[:, None] & (bands.wavenumber > 0.0)] = 0.0
+            names = ("sensed", "position", "normal_load", "flags")
+            return found["drive"], target, found["flags"], Sensed(**{name: found[name] for name in names})
 
         return advance
 
@@ -140,12 +141,12 @@ class SerialDriver(BaseDriver):
         velocity = (there - here) * 1e4
         self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self.finger.load(now[:1])[0], clock)
 
-    def columns(self, rows: Array) -> tuple[Array, Array, Array, Array, Array, Array]:
-        """Split rows (n, columns) into drive (A), sensed (m), position (m), load (N), reference (m) and flags."""
+    def signals(self, rows: Array) -> dict[str, Array]:
+        """Signals of rows (n, columns), see `Rows`, by their names in a recording."""
         a, b = self.drive_channels, self.drive_channels + self.sensed_channels
         rows = rows.reshape(-1, b + 4)
-        position, load, reference, flags = rows[:, b:].T
-        return rows[:, :a], rows[:, a:b], position, load, reference, flags.astype(np.int64)
+        signals = dict(zip(("position", "normal_load", "reference", "flags"), rows[:, b:].T, strict=True))
+        return signals | {"drive": rows[:, :a], "sensed": rows[:, a:b], "flags": signals["flags"].astype(np.int64)}
 
     def _open(self) -> None:
         self.client.open()
@@ -162,8 +163,8 @@ class SerialDriver(BaseDriver):
             self._sent = len(drive)
         client.queue(self._sent, drive)
         self._sent += len(drive)
-        _, sensed, _, _, _, flags = self.columns(client.rows(self.block))
-        return Sensed(sensed, flags=flags)
+        found = self.signals(client.rows(self.block))
+        return Sensed(found["sensed"], flags=found["flags"])
 
     def close(self) -> None:
         """Stop the board and close the port; once closed it stays so."""

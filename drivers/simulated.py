@@ -21,13 +21,8 @@ class SimulatedDriver(BaseDriver):
     def __init__(self, plant: Plant, locate: Callable[[Array], Array] | None = None) -> None:
         self.plant, self._locate = plant, locate
         self._played = False
-        super().__init__(
-            rate=plant.rate,
-            drive_channels=plant.drive_channels,
-            sensed_channels=plant.sensed_channels,
-            block=plant.block,
-            delay=plant.delay,
-        )
+        own = ("rate", "drive_channels", "sensed_channels", "block", "delay")
+        super().__init__(**{name: getattr(plant, name) for name in own})
 
     def device_loop(self, controller: Controller) -> DeviceLoop | None:
         """Return the compiled loop of plant and controller; None where they have to run block by block.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.errors import ProtocolError
 from hapticrender.protocols import Array, Sensed
 
@@ -46,6 +47,14 @@ def check_driver(driver: Any) -> None:
         value = getattr(driver, name)
         if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
             raise ValueError(f"{kind}: {name}={value!r} must be a whole number >= {least}, an int")
+
+
+def check_channels(driver: Any, drive: Mapping[int, str], sensed: Mapping[int, str]) -> None:
+    """Refuse a driver whose numbers of channels are not among those in `drive` and `sensed`, each with its meaning."""
+    for name, known in (("drive_channels", drive), ("sensed_channels", sensed)):
+        found = getattr(driver, name)
+        bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
+        require(found in known, f"driver.{name}", found, bound)
 
 
 def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:

@@ -157,11 +157,3 @@ def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[s
         return assumed, assumed
     with checks.inside("simulation"):
         return assumed, kind.with_overrides({**scene.profile, **scene.simulation})
-
-
-def check_channels(driver: Driver, drive: Mapping[int, str], sensed: Mapping[int, str]) -> None:
-    """Refuse a driver whose numbers of channels are not among those in `drive` and `sensed`, each with its meaning."""
-    for name, known in (("drive_channels", drive), ("sensed_channels", sensed)):
-        found = getattr(driver, name)
-        bound = " or ".join(f"{count} ({meaning})" if meaning else str(count) for count, meaning in known.items())
-        checks.require(found in known, f"driver.{name}", found, bound)

@@ -13,9 +13,10 @@ from functools import cached_property
 
 from hapticrender.checks import inside, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.driver_checks import check_channels
 from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import check_channels, check_tables, read_devices
+from hapticrender.renderers.base import check_tables, read_devices
 from hapticrender.renderers.friction import HEADROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene

@@ -65,8 +65,7 @@ class FrictionSetup:
         time = examined(self.scene)
         load = self.scene.finger.load(time)[np.isfinite(self.scene.finger.position(time))]
         mean = float(load.mean()) if load.size else 0.0
-        if not mean > 0.0:
-            raise ValueError("finger.normal_load = 0: must be > 0 N, friction needs a load")
+        require(mean > 0.0, "finger.normal_load", mean, "> 0 N, friction needs a load")
         return mean
 
     @cached_property

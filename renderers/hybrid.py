@@ -23,12 +23,13 @@ from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.driver_checks import check_channels
 from hapticrender.mathx import on_time, smoothstep
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.plants.hybrid import PLACES, HybridPlant
+from hapticrender.plants.hybrid import COILS, PLACES, SENSORS, HybridPlant
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed
-from hapticrender.renderers.base import BaseRenderer, check_channels
+from hapticrender.renderers.base import BaseRenderer
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
 from hapticrender.renderers.limits import check_carriers, perceptible
@@ -38,7 +39,6 @@ from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene, scene_keys
 
 BOTH = "rate"  # the parameter that plate and screen share
-COILS = SENSORS = 2  # channels of the plate, which come first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,15 +128,9 @@ class HybridRenderer(BaseRenderer):
                 require(found == needed, f"{table}.{name}", found, f"{needed} on a hybrid")
         rate = of_screen.assumed.rate if driver is None else driver.rate
         bands = _share_out(scene, settings, of_plate.assumed, rate)
-        return HybridSetup(
-            scene,
-            settings,
-            velocity_per_force,
-            bands,
-            replace(of_plate, scene=_part(plate, bands.plate)),
-            of_screen,
-            replace(of_screen, scene=_part(screen, bands.friction)) if len(bands.friction) else None,
-        )
+        of_plate = replace(of_plate, scene=_part(plate, bands.plate))
+        friction = replace(of_screen, scene=_part(screen, bands.friction)) if len(bands.friction) else None
+        return HybridSetup(scene, settings, velocity_per_force, bands, of_plate, of_screen, friction)
 
     def plant(self, setup: HybridSetup, seed: int) -> HybridPlant:
         """Return the simulated device with the scene's finger on it."""

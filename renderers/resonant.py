@@ -14,13 +14,12 @@ from hapticrender.control.device_model import Demand
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.control.methods import method_named
 from hapticrender.control.supervisor import Fault, supervised
-from hapticrender.driver_checks import check_sensed
+from hapticrender.driver_checks import check_channels, check_sensed
 from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
 from hapticrender.plants.friction_laws import friction_ratios, reference_amplitudes
 from hapticrender.plants.surface import SurfaceParameters, full_slew
 from hapticrender.plants.ultrasonic_kernels import amplitude_decay, references_within_reach
 from hapticrender.protocols import Array, Driver, Flag, Sensed
-from hapticrender.renderers.base import check_channels
 from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 

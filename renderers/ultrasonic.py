@@ -18,7 +18,7 @@ from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import check_channels, check_tables, read_devices
+from hapticrender.renderers.base import check_tables, read_devices
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.renderers.shaped import Port
@@ -35,6 +35,12 @@ class SurfaceSetup(FrictionSetup):
 
     assumed: SurfaceParameters
     simulated: SurfaceParameters
+
+    def amplitude(self, swing: float) -> float:
+        """Largest amplitude (m) for a `swing` (N) of the friction around the bias."""
+        share = swing / (self.assumed.friction_coefficient * self.load)
+        least = max(self.assumed.bias - share, self.assumed.least_ratio)
+        return float(self.assumed.friction_law.amplitude(least, self.load, self.speed))
 
 
 class UltrasonicRenderer(FrictionRenderer):
@@ -66,7 +72,6 @@ class UltrasonicRenderer(FrictionRenderer):
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
-        check_channels(driver, {1: ""}, {0: "", 1: ""})
         assumed, load = setup.assumed, setup.load
         model = _model(setup, driver)
         whole = assumed.friction_coefficient * load
@@ -77,7 +82,11 @@ class UltrasonicRenderer(FrictionRenderer):
             raise ValueError(f"texture.amplitude asks for {need:.3g} N of friction: {bound}")
         if driver.sensed_channels and assumed.sensor == "tribometer":
             setup.check_range(model, assumed.friction_coefficient * setup.largest_load)
-        _check_amplitude(assumed, need / whole, load, setup.speed)
+        amplitude, mode = setup.amplitude(need), assumed.mode
+        volts = mode.drive_for(amplitude, normal_load=load)
+        if volts > mode.drive_limit:  # however slow the texture is
+            needs = f"{amplitude:.3g} m, which takes {volts:.3g} V under {load:.3g} N"
+            raise ValueError(f"texture.amplitude asks for a vibration of {needs}: must be <= {mode.drive_limit:g} V")
         return replace(model, drive_limit=headroom)
 
     def bands(self, setup: SurfaceSetup, model: DeviceModel) -> Bands:
@@ -92,10 +101,7 @@ def _demand(setup: SurfaceSetup) -> Demand:
     """Amplitude (m) and drive (V) that the scene needs at most, with a finger that damps `WORST_SKIN` times as much."""
     assumed, mode = setup.assumed, setup.assumed.mode
     need = setup.needed(_model(setup, Port(assumed.rate, 1, 1)))
-    swing = need.drive / (assumed.friction_coefficient * setup.load)
-    amplitude = float(
-        assumed.friction_law.amplitude(max(assumed.bias - swing, assumed.least_ratio), setup.load, setup.speed)
-    )
+    amplitude = setup.amplitude(need.drive)
     worst = replace(mode, finger_damping=WORST_SKIN * mode.finger_damping)
     drive = worst.drive_for(amplitude, need.highest, setup.largest_load)
     return Demand(motion=amplitude, drive=drive, lowest=mode.frequency, highest=mode.frequency)
@@ -119,14 +125,3 @@ def _model(setup: SurfaceSetup, driver: Driver | Port) -> DeviceModel:
         )
     mass = model.mass + lag * model.damping + lag**2 / 2 * model.stiffness
     return replace(model, mass=mass, damping=model.damping + lag * model.stiffness)
-
-
-def _check_amplitude(surface: SurfaceParameters, swing: float, load: float, speed: float) -> None:
-    """Refuse a `swing` of the friction (1) around the bias for which the drive is too weak, however slow it is."""
-    least = max(surface.bias - swing, surface.least_ratio)
-    amplitude = float(surface.friction_law.amplitude(least, load, speed))
-    mode = surface.mode
-    volts = mode.drive_for(amplitude, normal_load=load)
-    if volts > mode.drive_limit:
-        needs = f"{amplitude:.3g} m, which takes {volts:.3g} V under {load:.3g} N"
-        raise ValueError(f"texture.amplitude asks for a vibration of {needs}: must be <= {mode.drive_limit:g} V")

@@ -13,9 +13,10 @@ from hapticrender.bands import Bands
 from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.supervisor import governed
+from hapticrender.driver_checks import check_channels
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import BaseRenderer, check_channels, check_tables, read_devices
+from hapticrender.renderers.base import BaseRenderer, check_tables, read_devices
 from hapticrender.renderers.limits import check_carriers, check_path, check_targets, demand, perceptible
 from hapticrender.touch.scene import Scene
 

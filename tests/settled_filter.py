@@ -1,6 +1,7 @@
 """Prediction of the settled motion filter: its response, its half-power frequency, and what its noise leaves."""
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from hapticrender.touch import latency_budget as budget
 from hapticrender.touch.motion_estimator import transition
@@ -28,6 +29,6 @@ def bandwidth(estimator, rate):
 def noise_errors(estimator, rate, ahead=0.0):
     """Standard errors of position (m) and velocity (m/s), `ahead` (s) of the last sample, by its noise alone."""
     a, b = budget._system(budget.settled_gain(estimator, rate), 1.0 / rate)
-    spread = estimator.variance * budget._noise_gain(a[:3, :3], b[:3])
+    spread = estimator.variance * solve_discrete_lyapunov(a[:3, :3], np.outer(b[:3], b[:3]))
     position, velocity, _ = np.sqrt(np.diagonal(transition(ahead) @ spread @ transition(ahead).T)).tolist()
     return position, velocity

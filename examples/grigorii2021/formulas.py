@@ -161,7 +161,7 @@ def plate() -> Item:
                why="the same"),
          Claim("inertia in F1 + F2, and so in F_f and Z_f, off by", 0,
                100 * float(np.abs(printed.sum(axis=0) / right.sum(axis=0) - 1).max()), 0.05, "%"),
-         Claim("command per coil current", -5, 1 / parameters.amplifier_gain, 0.5, "V/A")),
+         Claim("command per coil current, R1/(1 - R2/Rp)", -5, 10e3 / (1 - 2e3 / 1.0), 0.5, "V/A")),
         (Panel("Coils together: heave", FREQUENCY, unit,
                (Curve("centre", GRID, np.abs(motion[:, 0, 0])),
                 Curve("end 2", GRID, np.abs(motion[:, 0, 0] + lever * motion[:, 1, 0])),

@@ -81,9 +81,7 @@ def analyse_finger(
     late = course.plate.delay - block
     _check(recording, course.plate, late)
     rate = recording.rate
-    drive, sensed = (
-        np.stack([hold_last(each) for each in signal.T], axis=1) for signal in (recording.drive, recording.sensed)
-    )
+    drive, sensed = (np.apply_along_axis(hold_last, 0, each) for each in (recording.drive, recording.sensed))
     if free_start:
         sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
     signals = _Signals(course.plate, late, rate, drive, sensed)

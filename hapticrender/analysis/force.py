@@ -8,7 +8,7 @@ import numpy as np
 
 from hapticrender.analysis.course import Signals
 from hapticrender.analysis.smoothing import History, convolve, derivative_kernels, half_width, held_kernel
-from hapticrender.plants.plate import NOMINAL_AMPLIFIER, PlateParameters
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
 
 DIFFERENCES = 6  # order of the differences that show a sensor's noise
@@ -79,7 +79,7 @@ class MotionFilter:
         p = self._plate
         step, limit = p.current_step, p.current_limit
         current = step * np.floor(drive / step + 0.5) if step else drive
-        return np.clip(current, -limit, limit) @ p.force_from_drive.T * (p.amplifier_gain / NOMINAL_AMPLIFIER)
+        return np.clip(current, -limit, limit) @ p.force_from_drive.T
 
     def coordinate_noise(self, noise: Array) -> Array:
         """Standard deviation (m, (2,)) of heave and rocking for that of the sensors (m, (2,))."""

@@ -49,16 +49,8 @@ def impedance_of(
     by_plate = np.einsum("nbi,nij,nbj->nb", phi, covariance, phi.conj()).real / 2
     by_place = np.abs(value * amplitudes.velocity[..., 1] * (position_error / a)[:, None]) ** 2 / 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + np.abs(
-            value * gain_error
-        ) ** 2 / 2
+        by_gain = np.abs(value * gain_error) ** 2 / 2
+        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + by_gain
         clear = np.abs(velocity) > CLEAR * np.abs(s) * noise[0] * np.sqrt(lines.variance)
-    return Impedance(
-        lines.time,
-        lines.frequency,
-        np.where(clear, value, np.nan),
-        np.where(clear, np.sqrt(variance), np.nan),
-        load,
-        position,
-        velocity,
-    )
+    value, error = (np.where(clear, each, np.nan) for each in (value, np.sqrt(variance)))
+    return Impedance(lines.time, lines.frequency, value, error, load, position, velocity)

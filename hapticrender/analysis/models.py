@@ -13,7 +13,7 @@ from hapticrender.analysis.records import FingerRecord
 from hapticrender.analysis.samples import APART, Samples, Source, parts_of, samples_of
 from hapticrender.checks import require
 from hapticrender.protocols import Array
-from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, FingerMechanics
+from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, PARTS, FingerMechanics
 
 LOAD_CLASSES: Mapping[str, tuple[float, float]] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
 FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
@@ -21,7 +21,6 @@ UNITS = {  # of the fit's parameters, which are then near 1: g, N s/m, N/mm
     "mass": 1e-3, "damping": 1.0, "stiffness": 1e3, "phalanx_mass": 1e-3, "phalanx_damping": 1.0,
     "phalanx_stiffness": 1e3, "load_exponent": 1.0,
 }  # fmt: skip
-NAMES = tuple(UNITS)[:6]
 MOST = dict(zip(UNITS, (1.0, 1e4, 1e6, 1.0, 1e4, 1e6, 10.0), strict=True))  # bounds of FingerMechanics
 MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would grow for ever
 _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
@@ -120,10 +119,7 @@ class FingerFit:
 
 
 def fit_finger(
-    impedance: Source | Sequence[Source],
-    order: int | None = None,
-    *,
-    loads: tuple[float, float] = (0.0, inf),
+    impedance: Source | Sequence[Source], order: int | None = None, *, loads: tuple[float, float] = (0.0, inf)
 ) -> FingerFit:
     """Fit a finger of 2nd or 4th order to measured impedances by weighted complex least squares.
 
@@ -248,7 +244,7 @@ def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None
     """Fit one order, from several starts where it is the 4th, and the errors of the plates on the way."""
     from scipy.optimize import least_squares
 
-    names, logs = NAMES[: 3 * order // 2], np.log(samples.load)
+    names, logs = PARTS[: 3 * order // 2], np.log(samples.load)
     fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": 0.0}
     if np.ptp(logs) > APART:
         names = (*names, "load_exponent")
@@ -283,9 +279,9 @@ def _starts(samples: Samples, second: FingerFit | None) -> list[Array]:
     skin, so that it fits no worse.
     """
     if second is not None:
-        units = np.array([UNITS[name] for name in NAMES])
-        whole = [getattr(second.mechanics, name) / UNITS[name] for name in NAMES[:3]]
-        table = [[getattr(each, name) for name in NAMES] / units for each in (LIGHT, HEAVY)]
+        units = np.array([UNITS[name] for name in PARTS])
+        whole = [getattr(second.mechanics, name) / UNITS[name] for name in PARTS[:3]]
+        table = [[getattr(each, name) for name in PARTS] / units for each in (LIGHT, HEAVY)]
         return [np.append(each, 0.0) for each in (*table, [*_STIFF_SKIN, *whole])]
     w, weight = 2e-3 * np.pi * samples.frequency, 1 / samples.standard_error
     zero = np.zeros_like(w)

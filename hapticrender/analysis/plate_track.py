@@ -83,6 +83,5 @@ def track_of(course: Course, duration: float) -> PlateTrack:
     time = np.unique(np.r_[np.arange(0.0, duration, 1.0), duration])
     values = course.at(time)[:, 2:].T
     errors = np.array([np.sqrt(np.diagonal(course.covariance_at(each)))[2:] for each in time]).T
-    return PlateTrack(
-        time, dict(zip(TRACKED, values, strict=True)), dict(zip(TRACKED, errors, strict=True)), course.measured
-    )
+    tracks, spreads = (dict(zip(TRACKED, each, strict=True)) for each in (values, errors))
+    return PlateTrack(time, tracks, spreads, course.measured)

@@ -109,16 +109,13 @@ class LocalLine:
 
         `smoothed` is the spread (s) of that g.
         """
-        return self._half_power(0, smoothed), self._half_power(1, smoothed)
-
-    def _half_power(self, which: int, smoothed: float) -> float:
-        """First frequency (Hz, in steps of 0.05) at which level (0) or slope (1) passes less than half of the power."""
-        low = 0.0
-        for step, count in ((2.0, 250), (0.05, 40)):
-            frequency = low + step * np.arange(1, count + 1)
-            passed = np.exp(-((2 * np.pi * frequency * smoothed) ** 2)) * np.abs(self.response(frequency)[which]) ** 2
-            low += step * int(np.argmax(passed < 0.5))
-        return low + step
+        found = [0.0, 0.0]
+        for step, count in ((2.0, 250), (0.05, 40)):  # the first of less than half, in these steps
+            for which, low in enumerate(found):
+                f = low + step * np.arange(1, count + 1)
+                passed = np.exp(-((2 * np.pi * f * smoothed) ** 2)) * np.abs(self.response(f)[which]) ** 2
+                found[which] += step * int(np.argmax(passed < 0.5))
+        return found[0] + step, found[1] + step
 
     def fit(self, signal: Array, inside: Array) -> tuple[Array, Array, Array, Array]:
         """Level and slope (n, k) of a signal (n + behind + ahead, k), and the sums of squares of w and u (n,).

@@ -143,7 +143,7 @@ class FingerTracker:
             given = f"drive and measurement of shapes {shapes[0]} and {shapes[1]}"
             raise ValueError(f"{given}: must be {due[0]} and {due[1]}, in A and m, at least one sample")
         rows = np.vstack([self._held, np.column_stack([drive, sensed])])
-        rows = np.stack([hold_last(each)[1:] for each in rows.T], axis=1)
+        rows = np.apply_along_axis(hold_last, 0, rows)[1:]
         self._held, (drive, sensed) = rows[-1:], np.split(rows, [drive.shape[1]], axis=1)
         signals = self._filter.update(drive, sensed)
         time = (self._at + np.arange(len(drive))) / self.rate

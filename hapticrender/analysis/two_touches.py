@@ -99,6 +99,7 @@ class TouchMonitor:
         hertz = bins * model.rate / self.length
         self._bins = bins[(hertz >= BAND[0]) & (hertz <= min(BAND[1], top))][::SPACING]
         self._window = np.hanning(self.length + 1)[:-1]
+        self._variance = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit) ** 2  # of a sensor's noise (m2)
         self._noise = self._noise_density()
         largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
         self._prior = np.diag(np.append(np.repeat(largest, 3), DELAY_ERROR) ** -2.0)
@@ -161,18 +162,13 @@ class TouchMonitor:
     def _noise_density(self) -> Array:
         """Covariance of the force's spectrum by the sensors' noise, of 0 Hz and every bin, shape (bins + 1, 2, 2)."""
         model, power = self.model, float(np.sum(self._window**2))
-        variance = self._sensed_variance()
         turn = np.exp(2j * np.pi / self.length * np.multiply.outer(np.r_[0, self._bins], np.arange(TAPS)))
         h = turn @ self._filters.T
         terms = (model.stiffness, model.damping, model.mass)
         response = sum(h[:, k, None, None] * each for k, each in enumerate(terms)) @ model.coordinate_from_sensed
-        density = variance * power * response @ np.conj(np.swapaxes(response, 1, 2))
+        density = self._variance * power * response @ np.conj(np.swapaxes(response, 1, 2))
         density[0] += (DRIFT * self._window.sum()) ** 2 * (response[0] @ response[0].conj().T)
         return density.real  # the sensors are alike: cross terms are real but for the filters' tiny phase
-
-    def _sensed_variance(self) -> float:
-        """Variance of a sensor's noise (m2)."""
-        return max(self.model.sensed_noise, LEAST_NOISE * self.model.sensed_limit) ** 2
 
     def _spectrum(self, signal: Array) -> Array:
         """Hann-weighted spectrum at 0 Hz and at the bins, along the last axis."""
@@ -198,7 +194,7 @@ class TouchMonitor:
         """
         force, rows = self._spectrum(self._force(parts)), self._spectrum(self._regressors(parts))
         self._rest = force[:, 0].real
-        quiet = self._sensed_variance() * np.sum(self._window**2) * np.sum(self.model.coordinate_from_sensed[0] ** 2)
+        quiet = self._variance * np.sum(self._window**2) * np.sum(self.model.coordinate_from_sensed[0] ** 2)
         moved = np.flatnonzero(abs(rows[0, 0]) ** 2 > LEAST_SIGNAL * quiet)
         moved = moved[moved > 0]
         rows, force = np.moveaxis(rows[:, :, moved], 2, 0), force[:, moved].T[:, :, None]
@@ -308,21 +304,17 @@ class TouchWatch:
         monitor = self.monitor
         if monitor is None or self._law is None:
             return
-        two, tests = monitor.two, monitor.tests
-        if two != self._slowed or tests > self._tests:
-            self._slow_down(two, self._slowed)
-            self._slowed, self._tests = two, tests
-
-    def _slow_down(self, two: bool, before: bool) -> None:
-        """Set the law back at the first window with two touches, and slow it until there is one."""
-        law, kept, end = self._law, self._kept, int(LOAD)
-        if two and not before:
+        two, tests, law, kept, end = monitor.two, monitor.tests, self._law, self._kept, int(LOAD)
+        if two == self._slowed and tests <= self._tests:
+            return
+        if two and not self._slowed:
             law["theta"][:end], law["covariance"][:end] = law["prior"][:end], law["prior_covariance"][:end]
             law["covariance"][:, :end] = law["prior_covariance"][:, :end]
             law["theta"][DEVICE], law["covariance"][DEVICE, DEVICE] = kept["theta"], kept["covariance"]
         elif not two:
             self._note_device()
         law["noise"] = kept["noise"] * (SLOWER if two else 1.0)
+        self._slowed, self._tests = two, tests
 
     def _note_device(self) -> None:
         """Note what is learned of the device itself, while one finger explains the signals."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 POSITION, LOAD, STRENGTH, SPEED = range(4)  # columns of the inputs that every plant gets; a plant may add its own
-SENSOR_CLIPPED = int(Flag.SENSOR_CLIPPED)
+SENSOR_CLIPPED, SATURATED = int(Flag.SENSOR_CLIPPED), int(Flag.SATURATED)
 HUGE = 1e300  # a drive beyond it is no number
 
 
@@ -23,6 +23,16 @@ def quantise(value, step, limit):
     """Round to the nearest step inside +-`limit`; a step of 0 leaves the resolution ideal."""
     value = min(max(value, -limit), limit)
     return step * math.floor(value * (1.0 / step) + 0.5) if step > 0.0 else value
+
+
+def resolution(bits: str, span: str, times: float, about: str) -> Any:
+    """Property of parameters: the step of a converter with so many `bits` over `times` its `span`; 0 bits are ideal."""
+
+    def step(parameters: Any) -> float:
+        count = getattr(parameters, bits)
+        return times * getattr(parameters, span) / 2**count if count else 0.0
+
+    return property(step, doc=f"Resolution of {about}; 0 is ideal.")
 
 
 @kernel

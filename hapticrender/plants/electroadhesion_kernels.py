@@ -16,12 +16,12 @@ import numba
 import numpy as np
 
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, step
-from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SENSOR_CLIPPED, SPEED
+from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SATURATED, SENSOR_CLIPPED, SPEED
 from hapticrender.plants.gap import GAP, VACUUM, gap_step
 from hapticrender.plants.sliding_contact import SLIDING, sliding_step
 from hapticrender.protocols import Flag
 
-SATURATED, OPEN_LOOP = int(Flag.SATURATED), int(Flag.OPEN_LOOP)
+OPEN_LOOP = int(Flag.OPEN_LOOP)
 FRICTION, ATTRACTION = range(2)  # columns of `motion`
 INPUTS = 4  # columns of the inputs
 
@@ -146,9 +146,7 @@ def attract(s, drive, x, noise):
     lag = s.omega * resistance * VACUUM / thickness
     gap = complex(1.0, -lag) * (resistance / (1.0 + lag * lag))  # ohm m2
     impedance = s.body_resistance + (s.series_impedance + gap) * (1.0 / area)
-    source = (
-        1.0 + complex(0.0, s.omega * s.stray_capacitance) * impedance
-    )  # current of the source per current of the finger
+    source = 1.0 + complex(0.0, s.omega * s.stray_capacitance) * impedance  # its current per current of the finger
     peak /= abs(impedance) if s.voltage else abs(source)
     if s.carrier:
         s.capacitance[2] = VACUUM / thickness

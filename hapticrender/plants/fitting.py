@@ -25,7 +25,7 @@ from scipy.optimize import least_squares
 from hapticrender.control.probe import WIRINGS
 from hapticrender.errors import DesignError
 from hapticrender.plants.multisine import Multisine
-from hapticrender.plants.plate import PlateParameters, structure
+from hapticrender.plants.plate import SIDES, PlateParameters, structure
 from hapticrender.protocols import Array
 
 MECHANICAL = ("mass", "inertia", "stiffness_1", "stiffness_2", "damping_1", "damping_2")
@@ -126,13 +126,13 @@ def equation_error(expected: PlateParameters, record: Record, latest: int) -> tu
     motion = record.sensed[line] @ sensors.T
     masses, springs = expected.mass_matrix.diagonal(), expected.stiffness_matrix.diagonal()
     weight = 1 / (masses * abs(s[:, None]) ** 2 + springs)
-    sides = [(motion @ shape)[:, None] * shape for shape in np.array([[1.0, -1.0], [1.0, 1.0]])]
+    sides = [(motion @ shape)[:, None] * shape for shape in SIDES]
     inertial = [(s**2)[:, None] * motion * unit for unit in np.diag([1.0, expected.half_spacing**-2])]
     columns = np.stack([*inertial, *sides, *(s[:, None] * side for side in sides)], axis=-1)
     force = record.drive[line] @ expected.force_from_drive.T * np.sinc(turn)[:, None]
     delays = np.exp(-2j * np.pi * np.outer(turn, np.arange(latest + 1) + 0.5))
-    forces = _real((force * weight)[:, :, None] * delays[:, None])
-    basis, triangle = np.linalg.qr(_real(columns * weight[:, :, None]))
+    forces = as_real((force * weight)[:, :, None] * delays[:, None])
+    basis, triangle = np.linalg.qr(as_real(columns * weight[:, :, None]))
     shares = basis.T @ forces
     explained = (shares**2).sum(axis=0) / (forces**2).sum(axis=0)
     late = int(explained.argmax())
@@ -221,14 +221,14 @@ def output_error(start: PlateParameters, late: float, record: Record) -> Fit:
         return record.sensed - motion * [plate.sensor_gain_1, plate.sensor_gain_2]
 
     search = least_squares(
-        lambda unknown: _real((left(unknown) / scale)[1:]).ravel(), begin, xtol=1e-12, ftol=1e-12, gtol=1e-12
+        lambda unknown: as_real((left(unknown) / scale)[1:]).ravel(), begin, xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     covariance = np.linalg.inv(search.jac.T @ search.jac) / scale**2
     return Fit(plate_at(search.x), search.x[:count], covariance[:count, :count], left(search.x))
 
 
-def _real(values: Array) -> Array:
-    """Complex numbers (n, 2, ...) as twice as many real ones, shape (4n, ...)."""
+def as_real(values: Array) -> Array:
+    """Complex numbers (n,) or (n, 2, ...) as twice as many real ones, shape (2n,) or (4n, ...)."""
     flat = values.reshape(-1, *values.shape[2:])
     return np.concatenate([flat.real, flat.imag])
 

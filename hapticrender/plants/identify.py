@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.checks import require
-from hapticrender.driver_checks import check_driver, check_sensed
+from hapticrender.driver_checks import check_channels, check_driver, check_sensed
 from hapticrender.errors import DesignError, PlateMismatch
 from hapticrender.plants.fitting import (
     BENDING,
@@ -44,9 +44,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
-UNITS = dict(
-    zip((*NAMES, *BENDING), ("kg", "kg m2", "N/m", "N/m", "N s/m", "N s/m", "samples", "", "Hz", "", ""), strict=True)
-)
+UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
 RAMP = 0.05  # s: fade-in and fade-out of the drive
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
@@ -143,10 +141,12 @@ class Identified:
             f"{name:<17} {estimate.value:>12.6g} +- {estimate.interval:.2g} {UNITS[name]}".rstrip()
             for name, estimate in self.estimates.items()
         ]
-        modes, _ = self.parameters.modes()
+        modes, clear = self.parameters.modes()[0], self.significance
+        clear_at = f"bending clear by {clear:.0f} standard deviations, at {self.parameters.bending_mass:g} kg"
+        bending = clear_at if clear else f"no bending found up to {self.bending_top:.0f} Hz"
         verdict = "no more than noise" if self.explained else f"more than noise ({self.misfit_bound:.2f})"
         rows += [
-            f"{'modes':<17} {modes[0]:.2f} Hz, {modes[1]:.2f} Hz; {self._bending_text()}",
+            f"{'modes':<17} {modes[0]:.2f} Hz, {modes[1]:.2f} Hz; {bending}",
             f"{'sensor noise':<17} {1e6 * self.noise:.3f} um rms",
             f"{'unexplained':<17} {1e6 * self.residual:.3f} um rms, misfit {self.misfit:.2f}: {verdict}",
             "intervals are 95 %; a gain error common to both sensors scales all of them and cannot be identified",
@@ -163,13 +163,6 @@ class Identified:
         """Shape at the coils of the bending mode over its standard deviation; 0 where none was found."""
         coil = self.estimates.get("bending_coil", Estimate(0.0, 1.0))
         return abs(coil.value) / coil.interval * SIGMAS_95
-
-    def _bending_text(self) -> str:
-        if self.significance:
-            return (
-                f"bending clear by {self.significance:.0f} standard deviations, at {self.parameters.bending_mass:g} kg"
-            )
-        return f"no bending found up to {self.bending_top:.0f} Hz"
 
     def differences(self, designed: PlateParameters) -> tuple[Difference, ...]:
         """Return the estimates that differ from `designed` by more than twice their interval."""
@@ -292,17 +285,10 @@ def _with_bending(rigid: Fit, record: Record) -> Fit | None:
     return fit if clear > CLEAREST else None
 
 
-def check_channels(driver: Driver, count: int, what: str) -> None:
-    """Refuse a driver without `count` channels of drive and of sensors."""
-    check_driver(driver)
-    for name in ("drive_channels", "sensed_channels"):
-        found, bound = getattr(driver, name), f"{count}; identification needs a device with {what}"
-        require(found == count, f"{type(driver).__name__}: {name}", found, bound)
-
-
 def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
     """Check the arguments and return the length of the record in samples."""
-    check_channels(driver, 2, "two coils and two displacement sensors")
+    check_driver(driver)
+    check_channels(driver, {2: "both coils, to identify a plate"}, {2: "a displacement sensor at each end of it"})
     for name in ("coils", "degrees_of_freedom"):
         found = getattr(parameters, name)
         require(found == 2, name, found, "2 to identify heave and rocking")

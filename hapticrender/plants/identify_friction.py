@@ -22,9 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from hapticrender.driver_checks import check_channels, check_driver
 from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
-from hapticrender.plants.identify import SIGMAS_95, Estimate, check_channels, play
+from hapticrender.plants.fitting import as_real
+from hapticrender.plants.identify import SIGMAS_95, Estimate, play
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.touch.finger import Finger
@@ -33,6 +35,7 @@ REACH, GRID = 0.02, 10.0  # share of the expected resonance, Hz: range and spaci
 RING = 10.0  # time constants of the expected mode that the drive lasts before the record
 SHARE = 0.2  # of the drive's limit: largest drive of the lines
 MODULATION = 5.0  # Hz: of the current of a screen; what c leaves of a lag of 0.4 ms is 1e-4 of the gain (20 Hz: 1e-3)
+ONE = {1: "to identify a friction device"}  # channel
 UNKNOWNS = 3  # of a screen: mu, mu g, c
 LATE = 0.5  # samples: largest difference of the delay from the driver's
 UNEXPLAINED = 0.1  # largest share of the response that the model may leave
@@ -65,7 +68,8 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     The open driver takes V and senses m at the carrier's rate; a resonance within 2 % of the expected one is found.
     """
     mode, rate = parameters.mode, float(driver.rate)
-    check_channels(driver, 1, "one drive and one sensor")
+    check_driver(driver)
+    check_channels(driver, ONE, ONE)
     if rate <= (least := 2 * (1 + REACH) * mode.frequency):
         raise ValueError(
             f"driver.rate = {rate:g} Hz: must be > {least:g} Hz, twice the highest line around the resonance"
@@ -98,11 +102,11 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     begin[2] = math.log(abs(y / u).max() / abs(response(begin)).max())
     peak = abs(y).argmax()
     begin[3] = np.angle(response(begin) * u / y)[peak] / w[peak] * rate
-    fit = least_squares(lambda x: _real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
+    fit = least_squares(lambda x: as_real(response(x) * u - y) / scale, begin, xtol=1e-12, ftol=1e-12)
     spread = _spread(fit.jac, fit.fun, np.arange(len(fit.fun)))
     values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]
     names = ("frequency", "quality", "force_constant")
-    found = _found("ultrasonic", type(parameters), names, values, values * spread[:3], fit.fun, _real(y) / scale)
+    found = _found("ultrasonic", type(parameters), names, values, values * spread[:3], fit.fun, as_real(y) / scale)
     turn, late = rate / values[0], fit.x[3]
     if not abs(late) <= LATE:
         raise DesignError(
@@ -122,7 +126,8 @@ def identify_screen(
     `finger` gives load and position where it does not measure them.
     """
     rate, most = float(driver.rate), parameters.current_limit / 2
-    check_channels(driver, 1, "one drive and one sensor")
+    check_driver(driver)
+    check_channels(driver, ONE, ONE)
     time = np.arange(round(seconds * rate)) / rate
     phase = 2 * np.pi * MODULATION * (time - (driver.delay - driver.block) / rate)
     drive = most * np.sqrt((1 + np.cos(2 * np.pi * MODULATION * time)) / 2)
@@ -157,10 +162,6 @@ def _spread(jacobian: Array, residual: Array, group: Array) -> Array:
     scores = np.stack([(jacobian[group == each] * residual[group == each, None]).sum(axis=0) for each in groups])
     covariance = inverse @ (scores.T @ scores) @ inverse
     return SIGMAS_95 * np.sqrt(np.diagonal(covariance) * len(groups) / max(len(groups) - jacobian.shape[1], 1))
-
-
-def _real(values: Array) -> Array:
-    return np.concatenate([values.real, values.imag])
 
 
 def _check_range(sensed: Array, bound: float, unit: str) -> None:

@@ -1,9 +1,9 @@
 """Choose the least model of a device whose difference from the full model stays inside a tolerance.
 
 Each level of a model is a linear model at the scene's carriers, loads and finger positions.  A level is compared with
-the full model under the same drive, the one with which the lesser level reaches its target; the predicted difference
-is the largest difference of their envelopes, over bands, places and path, relative to the band's target.  Nothing is
-simulated.
+the full model under the same drive, the one with which the lesser level reaches its target: with D the dynamic
+stiffness of the lesser level in heave and rocking, the force D r for the target r.  The predicted difference is the
+largest of their envelopes, over bands, places and path, relative to the band's target.  Nothing is simulated.
 """
 
 from __future__ import annotations
@@ -92,13 +92,7 @@ def least_model(scene: Scene, tolerance: float | None = None) -> LeastModel:
 
 
 def difference(scene: Scene, lesser: Scene) -> float:
-    """Predict the largest relative difference (1) of the envelopes of two levels under the lesser level's drive.
-
-    Notes
-    -----
-    With D the dynamic stiffness of the lesser level in heave and rocking, the force D r reaches the target r; the
-    motions under it are those of both levels.  Infinite where the difference is not quasi-static.
-    """
+    """Predict the largest relative difference (1) of the envelopes of two levels; infinite where not quasi-static."""
     predict = {"electroadhesion": _screen_difference, "ultrasonic": _surface_difference}.get(scene.device)
     return MARGIN * (_plate_difference(scene, lesser) if predict is None else predict(scene))
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.checks import require
-from hapticrender.plants.plate import PlateParameters
+from hapticrender.plants.plate import SIDES, PlateParameters
 from hapticrender.protocols import Array
 
 GRID = 12.0  # Hz between lines
@@ -21,7 +21,6 @@ REACH_UP = 2.1  # highest line over highest mode
 HIGHEST_SHARE = 0.4  # of the sampling rate: bound of the highest line of equal motion
 BENDING_TOP, BENDING_SHARE = 2200.0, 0.44  # Hz, of the sampling rate: bounds of the lines for a bending mode
 BENDING_GRID = 9.0  # Hz between these: a mode of 700 Hz and Q 50 is 14 Hz wide
-PATTERNS = np.array([[1.0, -1.0], [1.0, 1.0]])  # coil currents (rows) that drive heave and rocking (columns)
 CREST_ROUNDS = 200
 CREST_CLIP = 0.6  # of the peak
 
@@ -55,15 +54,15 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
     frequency = bins * base
     moved = model.response(frequency) * model.hold_and_delay(frequency)[:, None, None]
     ends = model.place_from_coordinate[1:] @ moved
-    own = np.diagonal(moved @ PATTERNS, axis1=1, axis2=2)[np.arange(len(bins)), coordinate]
+    own = np.diagonal(moved @ SIDES, axis1=1, axis2=2)[np.arange(len(bins)), coordinate]
     at_end = own * model.place_from_coordinate[2, coordinate]
-    current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * PATTERNS.T[coordinate]
+    current = (np.exp(1j * _phases(bins, coordinate, samples)) / at_end)[:, None] * SIDES.T[coordinate]
     motion = amplitude / float(abs(_period(bins, (ends @ current[:, :, None])[..., 0], samples)).max())
     drive = motion * _period(bins, current, samples)
     above = _spaced(REACH_UP * modes.max(), min(BENDING_TOP, BENDING_SHARE * rate), BENDING_GRID, base)
     if len(above):
         heave = np.zeros(len(above), int)
-        probe = _period(above, np.exp(1j * _phases(above, heave, samples))[:, None] * PATTERNS.T[heave], samples)
+        probe = _period(above, np.exp(1j * _phases(above, heave, samples))[:, None] * SIDES.T[heave], samples)
         drive += probe * (abs(drive).max() / abs(probe).max())
     if parameters.current_step:
         drive = parameters.current_step * np.round(drive / parameters.current_step)
@@ -111,7 +110,7 @@ def _phases(bins: Array, coordinate: Array, samples: int) -> Array:
     """
     count = np.arange(len(bins))
     phase = -math.pi * count * (count - 1) / len(bins)
-    signs = PATTERNS.T[coordinate]
+    signs = SIDES.T[coordinate]
     for _ in range(CREST_ROUNDS):
         ends = _period(bins, np.exp(1j * phase)[:, None] * signs, samples)
         bound = CREST_CLIP * abs(ends).max()

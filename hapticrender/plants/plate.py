@@ -19,7 +19,7 @@ from hapticrender.control.damping import BendingMode
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
 from hapticrender.mathx import state_space, zoh
-from hapticrender.plants.compiled import CompiledPlant
+from hapticrender.plants.compiled import CompiledPlant, resolution
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import NONE, FingerMechanics
@@ -28,12 +28,11 @@ if TYPE_CHECKING:
     from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
-SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2 per heave and rocking
+SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2, and their currents, by heave and rocking
 EXPECTED_BENDING = BendingMode(  # estimate for a plate that was not measured: 1.1-1.4 kHz, either sign
     frequency=1250.0, damping=0.01, coupling=(0.1 / 9.5e-3, 0.0), spread=150.0, measured=False
 )
 FREE_FREE = 2.365020372431352  # half of the first root of cos(x) cosh(x) = 1: the first even mode of a free bar
-NOMINAL_AMPLIFIER = (1 - 2e3 / 1.0) / 10e3  # A/V: gain of the default parts, by which a drive in A becomes volts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,9 +54,6 @@ class PlateParameters(Validated):
     force_constant: float = parameter(7.4, "N/A", "of each coil", above=0.0)
     coil_spacing: float = parameter(55e-3, "m", "distance between the coils", above=0.0)
     glass_length: float = parameter(110e-3, "m", "the sensors sit at its ends", above=0.0)
-    amplifier_r1: float = parameter(10e3, "ohm", "R1; the drive is the current that the default parts give", above=0.0)
-    amplifier_r2: float = parameter(2e3, "ohm", "R2; i = V/R1 (1 - R2/Rp)", above=0.0)
-    amplifier_rp: float = parameter(1.0, "ohm", "Rp", above=0.0)
     current_limit: float = parameter(3.0, "A", "of each coil", above=0.0)
     current_bits: int = parameter(12, about="resolution over +- current_limit, 0 is ideal", most=24)
     sensor_range: float = parameter(2e-3, "m", "full range of a sensor", above=0.0)
@@ -85,20 +81,8 @@ class PlateParameters(Validated):
         """Half the coil spacing a (m)."""
         return self.coil_spacing / 2
 
-    @property
-    def amplifier_gain(self) -> float:
-        """Coil current per command voltage (A/V): (1 - R2/Rp)/R1, about -1/5."""
-        return (1 - self.amplifier_r2 / self.amplifier_rp) / self.amplifier_r1
-
-    @property
-    def current_step(self) -> float:
-        """Resolution of the coil current (A); 0 is ideal."""
-        return 2 * self.current_limit / 2**self.current_bits if self.current_bits else 0.0
-
-    @property
-    def sensor_step(self) -> float:
-        """Resolution of a sensor (m); 0 is ideal."""
-        return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
+    current_step = resolution("current_bits", "current_limit", 2.0, "the coil current (A)")
+    sensor_step = resolution("sensor_bits", "sensor_range", 1.0, "a sensor (m)")
 
     @property
     def mass_matrix(self) -> Array:
@@ -290,7 +274,6 @@ def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Arra
         lever_per_metre=1.0 / p.half_spacing,
         reach=p.glass_length / p.coil_spacing,
         nodes_per_lever=(NODES - 1) / (2.0 * (p.glass_length / p.coil_spacing)),
-        amplifier=p.amplifier_gain / NOMINAL_AMPLIFIER,
         sensor_limit=p.sensor_range / 2,
         sensor_gain=(p.sensor_gain_1, p.sensor_gain_2),
         **{name: function.address for name, function in FUNCTIONS.items()},

@@ -66,7 +66,6 @@ PLATE = np.dtype(
         ("reach", "f8"),  # lever arm of the end of the glass
         ("nodes_per_lever", "f8"),
         ("current", "f8", (2,)),  # what the drive queue hands on (A)
-        ("amplifier", "f8"),  # current per drive
         ("current_limit", "f8"),
         ("current_step", "f8"),
         ("sensor_limit", "f8"),
@@ -232,7 +231,7 @@ def plate_step(state, signals, start, count):
     motion = carray(pointer(io.motion, F8), (stop, 4))
     flags = carray(pointer(io.flags, I8), stop)
     queue = carray(pointer(s.queue, F8), (s.latency, channels))
-    current_step, current_limit, amplifier = s.current_step, s.current_limit, s.amplifier
+    current_step, current_limit = s.current_step, s.current_limit
     sensor_step, sensor_limit, rms, gain = s.sensor_step, s.sensor_limit, s.sensor_noise, s.sensor_gain
     w, outputs, due, per_metre, rate = s.w, s.outputs, s.current, s.lever_per_metre, s.rate
     for n in range(start, stop):
@@ -240,7 +239,7 @@ def plate_step(state, signals, start, count):
             due[i] = drive[n, i]
         s.oldest = queue_drive(queue, s.oldest, due, due)
         for i in range(channels):
-            w[8 + i] = amplifier * quantise(due[i], current_step, current_limit)
+            w[8 + i] = quantise(due[i], current_step, current_limit)
         flags[n] = 0
         for i in range(3):
             motion[n, i] = outputs[i, 0] * w[0] + outputs[i, 1] * w[1] + outputs[i, 2] * w[2]

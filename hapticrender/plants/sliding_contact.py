@@ -17,7 +17,7 @@ import numpy as np
 from hapticrender.checks import Validated, parameter, require
 from hapticrender.jit import kernel, record_of
 from hapticrender.mathx import foh
-from hapticrender.plants.compiled import quantise
+from hapticrender.plants.compiled import quantise, resolution
 from hapticrender.protocols import Array
 
 SLIDING = np.dtype(
@@ -59,10 +59,7 @@ class SlidingParameters(Validated):
         bound = f"<= {self.rate / 2:g} Hz, half the rate"
         require(self.tribometer_frequency <= self.rate / 2, "tribometer_frequency", self.tribometer_frequency, bound)
 
-    @property
-    def force_step(self) -> float:
-        """Resolution of the tribometer (N); 0 is ideal."""
-        return 2 * self.force_range / 2**self.force_bits if self.force_bits else 0.0
+    force_step = resolution("force_bits", "force_range", 2.0, "the tribometer (N)")
 
     def lag_response(self, frequency: Any, speed: float) -> Any:
         """Friction per steady friction (complex) at `frequency` (Hz), the hold and the sampling included.

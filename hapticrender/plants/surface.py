@@ -138,9 +138,11 @@ def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> Dev
     stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
     detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
     finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
+    inner = model.delay <= MOST_INNER_DELAY and turns(oscillators(model)) <= 1.0
+    paced, delay = (PACED_DELAY, model.delay + 1) if inner else (PACED_DELAY_ALONE, model.delay)
     return replace(
         model,
-        pace=_pace(model),
+        pace=paced * model.rate / delay,
         lock=lock,
         taps=TAPS,
         always_damped=True,
@@ -155,13 +157,6 @@ def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> Dev
             contact=None,
         ),
     )
-
-
-def _pace(model: DeviceModel) -> float:
-    """Bandwidth of the amplitude loop over that of a plate's rules."""
-    if model.delay <= MOST_INNER_DELAY and turns(oscillators(model)) <= 1.0:
-        return PACED_DELAY * model.rate / (model.delay + 1)
-    return PACED_DELAY_ALONE * model.rate / model.delay
 
 
 def full_slew(mode: UltrasonicParameters) -> float:

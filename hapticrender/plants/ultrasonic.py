@@ -17,7 +17,7 @@ from hapticrender.bands import NYQUIST_MARGIN
 from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
-from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant
+from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, resolution
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
 
@@ -154,15 +154,8 @@ class UltrasonicParameters(Validated):
         tuned = amplitude * float(self.damping(normal_load)) * 2 * math.pi * self.carrier / self.force_constant
         return tuned * math.hypot(1.0, modulation / float(self.pole(normal_load)))
 
-    @property
-    def drive_step(self) -> float:
-        """Resolution of the drive (V); 0 is ideal."""
-        return 2 * self.drive_limit / 2**self.drive_bits if self.drive_bits else 0.0
-
-    @property
-    def sensor_step(self) -> float:
-        """Resolution of the sensor (m); 0 is ideal."""
-        return self.sensor_range / 2**self.sensor_bits if self.sensor_bits else 0.0
+    drive_step = resolution("drive_bits", "drive_limit", 2.0, "the drive (V)")
+    sensor_step = resolution("sensor_bits", "sensor_range", 1.0, "the sensor (m)")
 
     def device_model(self, rate: float, delay: int) -> DeviceModel:
         """Device model of the free, cold plate in a loop of `rate` (Hz) and `delay` (samples)."""

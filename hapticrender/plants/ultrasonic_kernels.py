@@ -22,12 +22,10 @@ import numpy as np
 
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, kernel, pointer, step
-from hapticrender.plants.compiled import HUGE, LOAD, SENSOR_CLIPPED, SPEED, quantise, queue_drive
+from hapticrender.plants.compiled import HUGE, LOAD, SATURATED, SENSOR_CLIPPED, SPEED, quantise, queue_drive
 from hapticrender.plants.friction_laws import LAW, friction_ratio, reference_amplitude
 from hapticrender.plants.sliding_contact import SLIDING, sliding_step
-from hapticrender.protocols import Flag
 
-SATURATED = int(Flag.SATURATED)
 DAMPING, RESONANCE, INPUTS = 4, 5, 6  # columns of the inputs beside the finger's (N s/m, rad/s), and their number
 FRICTION, AMPLITUDE = range(2)  # columns of the surface's `motion`
 LEAST_SLEW = 0.05  # of the drive's slew: an amplitude beyond what it can hold is still approached, and flagged
@@ -188,10 +186,8 @@ def surface_step(state, signals, start, count):
     io = numba.carray(pointer(signals, SIGNALS_T), 1)[0]
     end = start + count
     drive, inputs = numba.carray(pointer(io.drive, F8), end), numba.carray(pointer(io.inputs, F8), (end, INPUTS))
-    noise, sensed = (
-        numba.carray(pointer(io.noise, F8), (end, 1 + s.substeps)),
-        numba.carray(pointer(io.sensed, F8), end),
-    )
+    noise = numba.carray(pointer(io.noise, F8), (end, 1 + s.substeps))
+    sensed = numba.carray(pointer(io.sensed, F8), end)
     motion, flags = numba.carray(pointer(io.motion, F8), (end, 2)), numba.carray(pointer(io.flags, I8), end)
     for n in range(start, end):
         x = inputs[n]

@@ -16,6 +16,7 @@ from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import _h5py, naming_damage
 from hapticrender.recordings.journal import Header, join
+from hapticrender.touch.tribometer import unwrap_counts
 
 METHOD = "recorded elsewhere"
 EVEN = 0.5  # samples: farthest that a time may be from its place on an even grid
@@ -124,9 +125,7 @@ def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, co
     values = np.squeeze(np.asarray(table[name]))
     require(values.ndim == 1 and values.dtype.kind in "iufb", f"column {name}", table[name], "numbers, one a sample")
     if counter and values.dtype.kind == "u":
-        values = values.astype(values.dtype.newbyteorder("="))
-        signed = f"i{values.itemsize}"  # of the first count, and of the steps
-        values = np.cumsum(np.append(values[:1].view(signed), np.diff(values).view(signed)), dtype=np.int64)
+        values = unwrap_counts(values)
     return scale * (values.astype(float) - offset)
 
 

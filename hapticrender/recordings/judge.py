@@ -9,14 +9,7 @@ import numpy as np
 
 from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
-from hapticrender.recordings.envelopes import (
-    DIVERGING,
-    FADE_IN,
-    RUNAWAY,
-    Envelopes,
-    amplitude_error,
-    judged_from,
-)
+from hapticrender.recordings.envelopes import DIVERGING, FADE_IN, RUNAWAY, Envelopes, amplitude_error, judged_from
 from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
 
 if TYPE_CHECKING:
@@ -241,10 +234,8 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     if header.motion_source == "inferred":
         notes.append(INFERRED)
     if header.motion_source == "sensors":
-        known = (
-            f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
-        )
-        notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {known}")
+        gain = f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
+        notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {gain}")
     if touched := _flag_counts(recording)[Flag.TWO_TOUCHES]:
         notes.append(f"more than one finger touched, in {percent(touched / len(recording))} of the samples")
     if "[touch_panel]" in header.scene:

@@ -12,6 +12,10 @@ from hapticrender.touch.scene import Scene
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")
 PAPER_FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0)  # Hz: the gratings of Grigorii et al. 2021
+SWEEPING = Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")  # to and fro, up to 80 mm/s
+LIFTING = Finger.sliding(  # slides, reverses, lifts and touches again
+    speed=0.08, normal_load=0.6, span=0.08, touches=[(0.5, 3.4), (3.8, 6.0)], mechanics="heavy"
+)
 
 
 def builtin_scenes() -> dict[str, Scene]:
@@ -34,24 +38,14 @@ def _scene(name: str, texture: Any, finger: Finger, duration: float, **fields: A
     return Scene(name=name, texture=texture, finger=finger, duration=duration, **fields)
 
 
-def _lifting() -> Finger:
-    """Finger that slides, reverses, lifts and touches again."""
-    return Finger.sliding(speed=0.08, normal_load=0.6, span=0.08, touches=[(0.5, 3.4), (3.8, 6.0)], mechanics="heavy")
-
-
-def _sweeping() -> Finger:
-    """Light finger that sweeps to and fro at up to 80 mm/s."""
-    return Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")
-
-
 def _on_the_plate() -> Iterator[Scene]:
     """The paper's gratings on the free plate, ridges of 1 mm, a recording, a slide, a press, and fast swipes."""
     for frequency in PAPER_FREQUENCIES:
         texture = Grating(amplitude=10e-6, frequency=frequency)
         yield _scene(f"grating-{frequency:g}", texture, Finger.absent(), 5.0, tolerance=0.02)
     ridges = Grating(amplitude=10e-6, wavelength=1e-3)  # 80 Hz at 80 mm/s
-    yield _scene("spatial-grating", ridges, _lifting(), 6.0)
-    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08), _sweeping(), 5.0)
+    yield _scene("spatial-grating", ridges, LIFTING, 6.0)
+    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08), SWEEPING, 5.0)
     wandering = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
     yield _scene("sliding", Grating(amplitude=50e-6, frequency=143.0), wandering, 5.0)  # near the rocking mode
     press = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")  # its sag is many times the target
@@ -63,9 +57,9 @@ def _on_the_plate() -> Iterator[Scene]:
 def _by_friction() -> Iterator[Scene]:
     """Ridges and a recording on a screen, swipes on an ultrasonic plate, and one that warms up."""
     ridges = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
-    yield _scene("screen-spatial", ridges, _lifting(), 6.0, device="electroadhesion")
+    yield _scene("screen-spatial", ridges, LIFTING, 6.0, device="electroadhesion")
     recorded = Synthetic(amplitude=40e-6, speed=0.08)
-    yield _scene("screen-recorded", recorded, _sweeping(), 5.0, device="electroadhesion")
+    yield _scene("screen-recorded", recorded, SWEEPING, 5.0, device="electroadhesion")
     swipes = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
     slower = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)
     yield _scene("ultrasonic-swiping", slower, swipes, 4.0, device="ultrasonic")

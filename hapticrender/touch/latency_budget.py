@@ -51,15 +51,6 @@ def _system(gain: Array, step: float, latency: float = 0.0, smoothing: float = 0
     return a, b
 
 
-def _noise_gain(a: Array, b: Array) -> Array:
-    """S of the module: covariance of the state under white noise of variance 1."""
-    total, power = np.outer(b, b), a
-    with np.errstate(under="ignore"):
-        for _ in range(24):  # S over 2^k samples, doubled each time
-            total, power = total + power @ total @ power.T, power @ power
-    return total
-
-
 def position_error(
     panel: TouchPanel,
     speed: float = SPEED,
@@ -92,9 +83,11 @@ def position_error(
     estimator, square, weight = panel.estimator(), 0.0, 0.0
     variance = estimator.variance + (rms * panel.jitter) ** 2
     if predicted:
+        from scipy.linalg import solve_discrete_lyapunov
+
         a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, smoothing)
         turn = np.exp(1j * omega * step)
-        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), _noise_gain(a, b)
+        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), solve_discrete_lyapunov(a, np.outer(b, b))
     shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
     while shares[-1] * panel.dropouts > MOST_LOST:
         shares.append(shares[-1] * panel.dropouts)

@@ -16,7 +16,7 @@ LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
 LIGHT_LOAD, HEAVY_LOAD = 0.3, 0.8  # N: engineering defaults for what "light" and "heavy" were measured at
 
 
-_PARTS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
+PARTS = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,9 +66,9 @@ class FingerMechanics(Validated):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.require(self.order in (0, 2, 4), "order", self.order, "0, 2 or 4")
-        for key in _PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
+        for key in PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
             checks.require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
-        if self.order and not any(getattr(self, key) for key in _PARTS[:3]):
+        if self.order and not any(getattr(self, key) for key in PARTS[:3]):
             raise ValueError(f"mass, damping, stiffness = 0: one must be > 0 where order = {self.order}")
 
     def impedance(self, frequency: Array) -> Array:
@@ -101,7 +101,7 @@ HEAVY_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.5, stiffness=300.0,
 
 def _fourth(whole: FingerMechanics, mass: float, damping: float, stiffness: float) -> FingerMechanics:
     """Skin in series with a phalanx that has the numbers of the whole finger."""
-    phalanx = {f"phalanx_{key}": getattr(whole, key) for key in _PARTS[:3]}
+    phalanx = {f"phalanx_{key}": getattr(whole, key) for key in PARTS[:3]}
     return replace(whole, order=4, mass=mass, damping=damping, stiffness=stiffness, **phalanx)
 
 

@@ -135,7 +135,14 @@ class MotionEstimator:
         if self._rejected is None:
             self._rejected = time, position
             return False
-        self._start_from_two(*self._rejected, time, position)
+        before, there = self._rejected
+        velocity = (position - there) / (time - before)
+        if abs(velocity) > FASTEST:  # no finger is so fast: start from the newer one
+            self._start(time, position)
+        else:  # from both, at the velocity between them
+            self._start(before, there)
+            self._covariance[1, 1] = max(self._covariance[1, 1], velocity**2)
+            self._correct(time, position, gate=math.inf)
         return True
 
     def at(self, time: float | Array) -> MotionEstimate:
@@ -161,16 +168,6 @@ class MotionEstimator:
         self._state = np.array([position, 0.0, 0.0])
         self._covariance = np.diag(self._prior + [self._sampled + self._prior[1] * self.jitter**2, 0.0, 0.0])
         self._time, self._rejected = time, None
-
-    def _start_from_two(self, before: float, there: float, time: float, position: float) -> None:
-        """Start from two samples, at the velocity between them; from the newer one, where no finger is so fast."""
-        velocity = (position - there) / (time - before)
-        if abs(velocity) > FASTEST:
-            self._start(time, position)
-            return
-        self._start(before, there)
-        self._covariance[1, 1] = max(self._covariance[1, 1], velocity**2)
-        self._correct(time, position, gate=math.inf)
 
     def _correct(self, time: float, position: float, gate: float = GATE) -> bool:
         """Predict to `time` and correct by a sample, unless it is beyond the gate."""
@@ -215,13 +212,7 @@ class Encoder(MotionEstimator):
     '3.960 mm, 40.00 mm/s'
     """
 
-    def __init__(
-        self,
-        resolution: float,
-        bits: int = 32,
-        origin: float = 0.0,
-        **motion: float,
-    ) -> None:
+    def __init__(self, resolution: float, bits: int = 32, origin: float = 0.0, **motion: float) -> None:
         step = checks.number("resolution", resolution, "m")
         checks.require(step != 0.0, "resolution", resolution, "the metres of a count, not 0")
         super().__init__(resolution=abs(step), **motion)

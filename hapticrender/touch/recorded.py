@@ -41,10 +41,8 @@ def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
     """Bands whose envelopes are to be analysed: over position, or over time below rate/2."""
     if speed is None:
         frequency = frequency[frequency < rate / 2]
-    none = np.zeros(frequency.size)
-    if speed is None:
-        return Bands(frequency=frequency, wavenumber=none, phase=none.copy())
-    return Bands(frequency=none, wavenumber=frequency / speed, phase=none.copy())
+        return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
+    return Bands(frequency=0 * frequency, wavenumber=frequency / speed, phase=0 * frequency)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -49,8 +49,7 @@ def dumps(table: Mapping[str, Any]) -> str:
     amplitude = 1e-05
     <BLANKLINE>
     """
-    plain = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
-    lines = [*plain]
+    lines = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
     for key, value in table.items():
         if isinstance(value, Mapping):
             lines += ["", f"[{_key(key)}]", *(f"{_key(inner)} = {_value(entry)}" for inner, entry in value.items())]

@@ -59,9 +59,10 @@ class SwipeRecording:
 
 
 def unwrap_counts(counts: Array) -> Array:
-    """Positions (int64 counts from the first) of a 32-bit counter that wraps through 2**32 both ways."""
-    steps = np.diff(counts.astype(np.uint32)).view(np.int32)
-    return np.concatenate([[0], np.cumsum(steps, dtype=np.int64)])
+    """Positions (int64) of a counter of unsigned integers that wraps both ways, from the first count, signed, on."""
+    counts = counts.astype(counts.dtype.newbyteorder("="))
+    signed = f"i{counts.itemsize}"
+    return np.cumsum(np.append(counts[:1].view(signed), np.diff(counts).view(signed)), dtype=np.int64)
 
 
 def load_swipe(file: str) -> SwipeRecording:
@@ -79,7 +80,7 @@ def _load_swipe(file: str, changed: int) -> SwipeRecording:
     rate = checks.number("rate", _scalar(raw["rate"]), "Hz", above=0, most=1e6)
     metre_per_count = checks.number("metre_per_count", _scalar(raw["metre_per_count"]), "m", above=0, most=1e-3)
     lateral, normal = (_row(raw, key, "iuf", "numbers in N").astype(float) for key in ("lateral_force", "normal_force"))
-    position = unwrap_counts(_row(raw, "encoder", "iu", "integer counts")) * metre_per_count
+    position = unwrap_counts(_row(raw, "encoder", "iu", "integer counts").astype(np.uint32)) * metre_per_count
     if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
         sizes = f"{position.size}, {lateral.size}, {normal.size}"
         bound = f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
