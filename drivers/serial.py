@@ -7,6 +7,7 @@ The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's par
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,7 @@ from hapticrender.protocols import Array, Controller, Exchange, Rendering, Sense
 
 PATIENCE = 0.3  # s that a board has to answer where boards are listed
 HOST_BLOCK = 100  # samples of drive from the host
+LONGEST_MEAN = 1000.0  # s, of a board; a mean over a shorter time has the larger peaks, and so stops no later
 
 
 class SerialDriver(BaseDriver):
@@ -99,16 +101,18 @@ class SerialDriver(BaseDriver):
         if self.block != 1:
             return None
         inner: Any = getattr(controller, "controller", controller)
-        if self.rendering is None or inner.method != "inverse":
+        rendering = self.rendering
+        if rendering is None or inner.method != "inverse":
             raise DriverError(
                 f"{self}: exchange: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
-        bands, texture = playable(self.rendering, self.capabilities)
+        bands, texture = playable(rendering, self.capabilities)
         if texture is not None and inner.n_bands:
             raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
+                self.protect(rendering)
                 self._begin(bands, texture)
             drive, sensed, position, load, _, flags = self.columns(self.client.rows(count, self._point))
             envelope = np.zeros(0) if bands.envelope is None else bands.envelope
@@ -121,6 +125,15 @@ class SerialDriver(BaseDriver):
     def loop(self, rendering: Rendering) -> BoardLoop:
         """Return a loop of the board's own for live play, see `hapticrender.Player`."""
         return BoardLoop(rendering, self)
+
+    def protect(self, rendering: Rendering) -> None:
+        """Send the limits of the device, where they are below those of the board's design."""
+        model, most = rendering.model, self.capabilities.drive_limit
+        peak, step = rendering.scene.device_profile.limits.peak_drive or most, model.drive_step
+        if step > 0.0 and peak < most:
+            peak = step * math.floor(peak / step)  # what the converter rounds up would pass it
+        peak = min(peak, most)
+        self.client.limits(peak, min(model.rms_limit, peak), min(model.rms_time, LONGEST_MEAN), model.sensed_bound)
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         self._begun, client = True, self.client

@@ -18,7 +18,7 @@
 #include "texture.h"
 
 enum {
-    BOARD_VERSION = 3,
+    BOARD_VERSION = 4,
     BOARD_SILENCE_MS = 80,                        /* without a keep-alive (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
@@ -90,6 +90,7 @@ typedef struct {
     uint32_t committed;                           /* 1: this session has set-points */
     real_t gain;
     real_t peak, rms, heating, heat;              /* A, A, pole a sample, A^2 */
+    real_t displacement;                          /* m: bound of a sensor */
     real_t fade, fade_step, fade_to;
     uint32_t invalid;                             /* samples in a row */
     line_t lines[BOARD_LINES];
