@@ -94,6 +94,7 @@ class AudioDriver(BaseDriver):
         if delay is not None and not block <= delay <= LONGEST * rate:
             raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
+        self.drive_limit = drive_per_full_scale
         self.sensed_scale, self.drive_scale = sensed_per_full_scale or 1.0, 1.0 / drive_per_full_scale  # of an entry
         needed = {"delay": delay, "sensed_per_full_scale (m)": sensed_per_full_scale}
         self._unknown = [name for name, value in needed.items() if value is None and self.inputs]

@@ -58,6 +58,7 @@ class SerialDriver(BaseDriver):
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
             found = self.capabilities = client.capabilities
+            self.drive_limit = found.drive_limit
         super().__init__(
             rate=found.rate,
             drive_channels=found.drive_channels,

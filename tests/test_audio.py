@@ -254,6 +254,13 @@ def test_the_delay_of_a_loop_is_that_of_its_cable():
     assert "delay 163.50 samples (3.406 ms) at 48000 Hz in blocks of 64; 3 runs, spread 0.00" in str(found)
 
 
+def test_the_driver_may_be_a_text(monkeypatch):
+    monkeypatch.setattr("other_plate.cable", lambda: Cable(100, noise=1e-4), raising=False)
+    assert measure_latency("other_plate:cable", runs=1).delay == measure_latency(Cable(100, noise=1e-4), runs=1).delay
+    with pytest.raises(ValueError, match="driver = 'simulated': must be a device with a cable, such as audio:0"):
+        measure_latency("simulated")
+
+
 def test_a_run_that_lost_a_block_gives_no_gain():
     """64 of 2400 samples leave a correlation of 0.987, and a gain that is 2.7 % off."""
     found = measure_latency(Cable(100, noise=1e-4, losing=(0,), gap=10), runs=1)

@@ -83,7 +83,7 @@ GROUND = {
     f"hapticrender.{name}"
     for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "vectors", "mathx")
 }
-GROUND |= {f"hapticrender.{name}" for name in ("defaults", "driver_checks")}
+GROUND |= {f"hapticrender.{name}" for name in ("defaults", "devices", "driver_checks")}
 DEVICES = {"touch", "control", "plants"}
 MAY_IMPORT = {  # package: the others that it may import; renderers and drivers are found by their entry points
     "ground": set(),
