@@ -360,3 +360,15 @@ def test_benchmarks_find_the_kernels_that_tests_have_cached():
     """Numba names the module that compiled a kernel: `strangers_plate` here, `tests.strangers_plate` there."""
     code = "import benchmarks.faults, strangers_plate"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_every_test_that_the_page_on_safety_names_is_there():
+    """A name such as `..._the_peak_is_held_...` belongs to the file that is named last before it."""
+    names = None
+    for word in re.findall(r"`([^`\n]+)`", (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")):
+        if found := re.fullmatch(r"(?:tests/)?(test_\w+)(?:\.py)?", word):
+            file = ROOT / "tests" / f"{found[1]}.py"
+            names = re.findall(r"^def (test_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+        elif word.startswith("..._"):
+            pattern = re.escape(word).replace(re.escape("..."), ".*")
+            assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
