@@ -4,7 +4,7 @@
  * docs/protocol.md has every frame.  A set-point acts only after a COMMIT whose digest is that of what the board holds;
  * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a keep-alive for
  * 80 ms, or without a beat of the application for the time of its watchdog, the drive fades out within 10 ms.  Static
- * memory: sizeof(board_t), no heap, no recursion.
+ * memory: BOARD_BYTES of design.h, no heap, no recursion.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -111,6 +111,10 @@ typedef struct {
     size_t sending_in, sending_out;
     textures_t textures;                          /* last, as they are large */
 } board_t;
+
+/* Does not compile where a board takes more than design.h states; pointers and size_t of 8 bytes, and double, may. */
+typedef char board_bytes_hold[sizeof(board_t) <= BOARD_BYTES * (sizeof(real_t) / 4u) + 16u * (sizeof(void *) - 4u)
+                                  ? 1 : -1];
 
 /* Set the board to rest, as after a reset. */
 void board_init(board_t *board);
