@@ -240,6 +240,7 @@ def test_more_bands_than_a_frame_holds(tmp_path):
     program = build_board(tmp_path / "firmware", hr.prepare(SCENE), "-O1", "-DREAL_DOUBLE", bands=20)
     with SteppedBoard(tmp_path, program=program) as board:
         client = board.client().open()
+        client.limits(client.capabilities.drive_limit)  # a float, and in double perhaps above the limit itself
         client.set_bands(tones(*range(40, 340, 20), amplitude=1e-6))
         client.start()
         board.run(client, 0.1)
