@@ -46,8 +46,8 @@ class AudioDriver(BaseDriver):
     channels : tuple of int, >= 1
         Outputs that carry the drive, in the order of the drive's columns.
     sensed_channels : tuple of int, >= 1, optional
-        Inputs that sense, in the order of the sensors.  Unless given: (1, 2) where `delay` and `sensed_per_full_scale`
-        are known, otherwise none: the device is driven open loop.
+        Inputs that sense, in the order of the sensors.  Unless given: none where neither `delay` nor
+        `sensed_per_full_scale` is known, and the device is driven open loop; otherwise (1, 2), for which both must be.
     rate : float, Hz
     block : int, samples
         Frames a callback.
@@ -82,7 +82,7 @@ class AudioDriver(BaseDriver):
         delay: float | None = None,
     ) -> None:
         if sensed_channels is None:
-            sensed_channels = () if delay is None or sensed_per_full_scale is None else (1, 2)
+            sensed_channels = () if delay is None and sensed_per_full_scale is None else (1, 2)
         self.device, self.latency = device, latency
         self.channels, self.inputs = _channels("channels", channels), _channels("sensed_channels", sensed_channels)
         if not self.channels:
@@ -94,6 +94,7 @@ class AudioDriver(BaseDriver):
         if delay is not None and not block <= delay <= LONGEST * rate:
             raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
+        self.drive_limit = drive_per_full_scale
         self.sensed_scale, self.drive_scale = sensed_per_full_scale or 1.0, 1.0 / drive_per_full_scale  # of an entry
         needed = {"delay": delay, "sensed_per_full_scale (m)": sensed_per_full_scale}
         self._unknown = [name for name, value in needed.items() if value is None and self.inputs]
@@ -141,7 +142,7 @@ class AudioDriver(BaseDriver):
             raise DriverError(
                 f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
                 f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} "
-                "--out profile.toml`, give sensed_per_full_scale too, or leave out sensed_channels to drive open loop"
+                "--out profile.toml`, and give sensed_per_full_scale; or neither, or sensed_channels=(), for open loop"
             )
 
     def _open(self) -> None:

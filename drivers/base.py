@@ -19,6 +19,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     True where ``__exit__`` plays zeros by itself; otherwise the loop plays them before it leaves
 ``calibration`` (optional)
     relative uncertainty of the sensors' gain (0.01 is 1 %), which the verdict adds to its figures
+``drive_limit`` (optional)
+    A: largest drive that it plays, below which identification stays
 ``probe`` (optional)
     False where the start-up probe of a plate is to be left out (docs/safety.md)
 ``play_delay`` (optional)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -24,7 +25,7 @@ RETRY = 0.05  # s between two attempts to reach the board anew
 LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 DRIVE_ROWS = 24  # of drive in a frame
 FAULTS = {
-    Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise limits(rms=)",
+    Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise [limits] rms_drive",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
     Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
     Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
@@ -34,7 +35,7 @@ FAULTS = {
     "sources were exported for the scene that needs most",
     Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
-    Cause.BEYOND: "the motion stayed beyond what the scene can cause: check the unit of the sensors",
+    Cause.BEYOND: "a sensor shows more than [limits] displacement: press less, and check its unit and offset",
     Cause.SENSOR_GAIN: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",
     Cause.ACTUATOR_GAIN: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
     Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
@@ -48,7 +49,7 @@ class _Setup(NamedTuple):
     bands: Bands | None = None
     texture: BoardTexture | None = None
     gain: float = 1.0
-    limits: tuple[float, float, float] | None = None
+    limits: tuple[float, float, float, float] | None = None
     start: tuple[int, int] | None = None  # fields of START; None: at rest
 
 
@@ -178,12 +179,15 @@ class BoardClient(OpenedInWith):
         self._steadily(lambda line: line.command(Kind.GAIN, value))
         self._setup = self._setup._replace(gain=value)
 
-    def limits(self, peak: float, rms: float | None = None, seconds: float = 1.0) -> None:
+    def limits(
+        self, peak: float, rms: float | None = None, seconds: float = 1.0, displacement: float = math.inf
+    ) -> None:
         """Limit the drive of a channel: `peak` (A) is cut, `rms` (A) over a time constant of `seconds` stops the board.
 
-        Both are at most the limit of the board's design; rms is `peak` unless given.
+        Both are at most the limit of the board's design; rms is `peak` unless given.  So does a sensor beyond
+        `displacement` (m) while it plays; the bound of the design holds besides.
         """
-        limits = (peak, peak if rms is None else rms, seconds)
+        limits = (peak, peak if rms is None else rms, seconds, displacement)
         self._steadily(lambda line: line.command(Kind.LIMITS, *limits))
         self._setup = self._setup._replace(limits=limits)
 

@@ -41,6 +41,7 @@ class BoardLoop:
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
+        self.driver.protect(self.rendering)
         self._client.set_bands(self._bands, self._texture)
         self._client.start(stream=1, telemetry=TELEMETRY)
         self._reconnections = self._client.reconnections

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 3
+VERSION = 4
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
@@ -55,7 +55,7 @@ LAYOUT = {  # payloads, without the check value of commands; some go on with row
     Kind.SETPOINT: "<Bfffff",  # band; frequency, Hz; wavenumber, 1/m; phase, turns; target re, im, m
     Kind.COMMIT: "<BI",  # bands; CRC-32 of their set-points
     Kind.GAIN: "<f",  # 0 to 1
-    Kind.LIMITS: "<fff",  # peak, A; rms, A; time constant, s
+    Kind.LIMITS: "<ffff",  # peak, A; rms, A; time constant, s; displacement, m
     Kind.START: "<HH",  # samples between rows of the stream, and between telemetry; 0: none
     Kind.STOP: "<",
     Kind.LINE: "<BBfff",  # line; channel; frequency, Hz; amplitude, A; phase, turns

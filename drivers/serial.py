@@ -7,6 +7,7 @@ The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's par
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -24,6 +25,7 @@ from hapticrender.protocols import Array, Controller, DeviceLoop, Rendering, Sen
 
 LIST_TIMEOUT = 0.3  # s that a board has to answer where boards are listed
 HOST_BLOCK = 100  # samples of drive from the host
+LONGEST_MEAN = 1000.0  # s, of a board; a mean over a shorter time has the larger peaks, and so stops no later
 
 
 class SerialDriver(BaseDriver):
@@ -56,6 +58,7 @@ class SerialDriver(BaseDriver):
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
             found = self.capabilities = client.capabilities
+            self.drive_limit = found.drive_limit
         super().__init__(
             rate=found.rate,
             drive_channels=found.drive_channels,
@@ -99,16 +102,18 @@ class SerialDriver(BaseDriver):
         if self.block != 1:
             return None
         inner: Any = getattr(controller, "controller", controller)
-        if self.rendering is None or inner.method != "inverse":
+        rendering = self.rendering
+        if rendering is None or inner.method != "inverse":
             raise DriverError(
                 f"{self}: device_loop: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
-        bands, texture = playable(self.rendering, self.capabilities)
+        bands, texture = playable(rendering, self.capabilities)
         if texture is not None and inner.n_bands:
             raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
+                self.protect(rendering)
                 self._begin(bands, texture)
             found = self.signals(self.client.rows(count, self._point))
             envelope = np.zeros(0) if bands.envelope is None else bands.envelope
@@ -122,6 +127,15 @@ class SerialDriver(BaseDriver):
     def loop(self, rendering: Rendering) -> BoardLoop:
         """Return a loop of the board's own for live play, see `hapticrender.Player`."""
         return BoardLoop(rendering, self)
+
+    def protect(self, rendering: Rendering) -> None:
+        """Send the limits of the device, where they are below those of the board's design."""
+        model, most = rendering.model, self.capabilities.drive_limit
+        peak, step = rendering.scene.device_profile.limits.peak_drive or most, model.drive_step
+        if step > 0.0 and peak < most:
+            peak = step * math.floor(peak / step)  # what the converter rounds up would pass it
+        peak = min(peak, most)
+        self.client.limits(peak, min(model.rms_limit, peak), min(model.rms_time, LONGEST_MEAN), model.sensed_bound)
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         self._begun, client = True, self.client

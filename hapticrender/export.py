@@ -22,6 +22,8 @@ BANDS = 8  # of a board at least: set-points may need more than the scene does
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
+BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
+OTHER_BYTES, PAST_BYTES = 12_576, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
@@ -66,13 +68,21 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
         for name in ("design.h", "design.c"):
             _refuse_changed(folder / name, GENERATED)
     defines = "".join(f"#define LAW_{name} {value}\n" for name, value in sizes.items())
-    texts["design.h"] = f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{defines}\n#endif\n"
+    texts["design.h"] = f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{defines}\n{_memory(sizes)}\n#endif\n"
     tables = _table("design_t design", design), _table("supervision_t supervision", supervision_table(rendering))
     texts["design.c"] = f'{GENERATED}#include "supervisor.h"\n\n{tables[0]}\n{tables[1]}'
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     return [folder / name for name in sorted(texts)]
+
+
+def _memory(sizes: dict[str, int]) -> str:
+    """State the static memory of a board of these sizes."""
+    taken = OTHER_BYTES + (PAST_BYTES if sizes["DAMPER_TAPS"] > 16 else 0)
+    taken = -(-(taken + sum(each * sizes[name] for name, each in BYTES.items())) // 8) * 8
+    told = f"/* Bytes of board_t, with real_t and pointers of 4: {taken + 65_536} with the textures of texture.h. */"
+    return f"{told}\n#define BOARD_BYTES ({taken}u + 8u * TEXTURE_RING + 4u * TEXTURE_POINTS)\n"
 
 
 def sources() -> list[Path]:

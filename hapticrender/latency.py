@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hapticrender.devices import open_driver
 from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Flag
 from hapticrender.touch.device_profile import DeviceProfile
@@ -85,8 +86,9 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
 
     Parameters
     ----------
-    driver : Driver
-        Any object with `play`; not opened yet.  One with ``loop_back()`` makes a new driver for every run.
+    driver : Driver or str
+        Any object with `play`, not opened yet, or a text as ``--driver`` takes it.  One with ``loop_back()`` makes a
+        new driver for every run.
     runs : int, >= 1
     amplitude : float, > 0
         Of the burst, in the unit of the drive; of full scale for a sound card.
@@ -100,6 +102,8 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     """
     if runs < 1 or not 0 < amplitude < np.inf:
         raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
+    if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
+        raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
     rng, trips, tries = np.random.default_rng(0), [], 0
     for opened in _opened(driver):
         tries += 1

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import hapticrender as hr
+from hapticrender.devices import open_driver
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.audio_callback import AHEAD, LOST, SLOTS, BlockQueue, Relay
@@ -173,16 +174,22 @@ def test_the_delay_is_the_cards_and_that_of_play():
     ("known", "unknown"), [({"sensed_per_full_scale": 1e-3}, "delay"), ({"delay": 128.0}, "sensed_per_full_scale")]
 )
 def test_no_loop_is_closed_with_what_is_unknown(known, unknown):
-    """Without sensed channels there is no loop, and nothing has to be known."""
-    assert AudioDriver("0", **known).sensed_channels == 0
-    for driver in (AudioDriver("0", (3, 4), (5, 6), **known), AudioDriver("0", (3, 4), (5, 6), **known).live()):
-        message = (
-            f"audio:0: {unknown}.* is unknown.*connect output 3 to input 5.*`hapticrender latency --driver audio:0"
-        )
+    """Without sensed channels there is no loop, and nothing has to be known; one of two numbers asks for one."""
+    assert AudioDriver("0", sensed_channels=(), **known).sensed_channels == AudioDriver("0").sensed_channels == 0
+    profile = hr.DeviceProfile(kind="vt-plate", calibration=known)
+    chosen = AudioDriver("0", (3, 4), (5, 6), **known)
+    cables = {chosen: "3 to input 5", chosen.live(): "3 to input 5", open_driver("audio:0", profile): "1 to input 1"}
+    for driver, cable in cables.items():
+        message = f"audio:0: {unknown}.* is unknown.*connect output {cable}.*`hapticrender latency --driver audio:0"
         with pytest.raises(DriverError, match=message):
             driver.open()
         with pytest.raises(DriverError, match=message):  # and before anything is designed for a delay that is none
             hr.prepare(hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=1e-5), duration=0.1), driver=driver)
+    scene = hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=1e-5), duration=0.1, calibration=known)
+    with pytest.raises(DriverError, match=message):
+        hr.render(scene, driver="audio:0")
+    with hr.Player(scene, driver="audio:0") as player, pytest.raises(DriverError, match=message):
+        player.play(scene.texture)
 
 
 def test_a_driver_that_is_not_open_plays_nothing():
@@ -245,6 +252,13 @@ def test_the_delay_of_a_loop_is_that_of_its_cable():
     assert found.gain == pytest.approx(-0.1, rel=0.01)
     assert len(found.trips) == 3
     assert "delay 163.50 samples (3.406 ms) at 48000 Hz in blocks of 64; 3 runs, spread 0.00" in str(found)
+
+
+def test_the_driver_may_be_a_text(monkeypatch):
+    monkeypatch.setattr("other_plate.cable", lambda: Cable(100, noise=1e-4), raising=False)
+    assert measure_latency("other_plate:cable", runs=1).delay == measure_latency(Cable(100, noise=1e-4), runs=1).delay
+    with pytest.raises(ValueError, match="driver = 'simulated': must be a device with a cable, such as audio:0"):
+        measure_latency("simulated")
 
 
 def test_a_run_that_lost_a_block_gives_no_gain():

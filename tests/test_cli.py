@@ -37,6 +37,8 @@ SCENE_FILES = {"scene.toml", "recording.au", "drive.wav", "sensed.wav", "summary
 class Hosted:
     """A board, as far as the verb `latency` looks."""
 
+    rate, delay = 5000.0, 3
+
     def driven_by_host(self):
         raise NotImplementedError
 
@@ -306,9 +308,7 @@ BAD_ARGUMENTS = [
     (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
-    (["latency", "--driver", "simulated"], "must be a device with a cable, such as audio:0"),
     (["latency", "--driver", "wavefile:{out}.wav"], "senses nothing: a round trip needs an input"),
-    (["latency", "--driver", "test_cli:Hosted"], "the loop runs on the board, whose design states its delay"),
     (["latency", "--driver", "audio:no such card"], "audio:"),
     (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
@@ -328,6 +328,19 @@ def test_bad_arguments_get_one_line_and_nothing_is_written(run, tiny, tmp_path, 
     assert words.format(**places) in complaint(run(*(argument.format(**places) for argument in arguments)))
     assert sorted(tmp_path.rglob("*")) == before
     assert tiny.read_text() == TINY
+
+
+@pytest.mark.parametrize(
+    ("driver", "where"),
+    [
+        ("simulated", "in [device] of the scene"),
+        ("test_cli:Hosted", "by the design of the board: 3 samples at 5000 Hz"),
+    ],
+)
+def test_latency_says_where_a_delay_is_stated(run, tmp_path, driver, where):
+    said = f"{driver}: nothing is measured or written: the delay is stated {where}\n"
+    assert run("latency", "--driver", driver, "--out", tmp_path / "plate.toml") == (0, said, [])
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("verb", "folder"), [("render", "out"), ("validate", "out/tiny")])

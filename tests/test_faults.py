@@ -133,6 +133,24 @@ def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
     assert not played[-25:].any()
 
 
+def test_an_exception_in_the_progress_of_a_run_ends_in_zero_drive(tmp_path):
+    """What the application does while it is told how far a run is; the journal holds all that was played."""
+
+    def progress(done, total):
+        if done >= 0.5:
+            raise RuntimeError("the app broke")
+
+    plate = Logged(block=25, told=25, delay=25)
+    with pytest.raises(RuntimeError, match="the app broke"):
+        hr.render(scene(), driver=plate, journal=tmp_path / "run.au", progress=progress)
+    played = np.concatenate(plate.played)
+    recording = hr.Recording.load(tmp_path / "run.au")
+    assert len(recording) > 0.5 * RATE
+    np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end
+    assert played[:-25].any()
+    assert not played[-25:].any()
+
+
 def test_the_loop_itself_ends_with_zero_drive():
     plate = Logged(block=4, told=8, delay=8)
     hr.render(scene(), driver=plate)

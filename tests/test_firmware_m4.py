@@ -6,7 +6,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from board import ROOT, compile_c
+from board import FIRMWARE, ROOT, SOURCES, compile_c
 from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
@@ -15,6 +15,7 @@ from hapticrender.drivers.serial import BoardClient
 from hapticrender.export import export
 
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
+M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
 SIZE = '#include <stdio.h>\n#include "law.h"\nint main(void) { return printf("%zu", sizeof(law_t)) < 0; }\n'
 COUNTS = ("nops", "free", "new", "touched", "most", "textures", "frame")
 NOISE = 0.7e-6 * np.sqrt(4 * np.pi * 10.0 / RATE)  # m: mean of two sensors, times the root of the observer's gain
@@ -26,26 +27,60 @@ def cross_tools():
         pytest.skip(f"no {' and no '.join(missing)} here: make packages installs them (gcc-arm-none-eabi, ...)")
 
 
-def built(folder, rendering, target):
+def built(folder, rendering, target, *options):
     cross_tools()
     export(rendering, folder, force=True)
-    subprocess.run(["make", "-s", "-C", folder, target], check=True)
+    subprocess.run(["make", "-s", "-C", folder, target, *options], check=True)
     return folder / target
 
 
-def test_the_law_needs_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, tmp_path):
-    """All that its parts ask of a C library; numbers of 64 bits would be functions of their own there."""
+def m4_symbols(folder, *options):
+    """Words that `nm` prints of every symbol of the portable objects in a folder: all that `make` builds."""
     cross_tools()
+    subprocess.run(["make", "-s", "-C", folder, f"CC={CROSS} {M4}"], check=True)
+    command = [CROSS.replace("gcc", "nm"), *options, *sorted(path.name for path in folder.glob("*.o"))]
+    symbols = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
+    return [line.split() for line in symbols.splitlines() if " " in line]
+
+
+def test_law_and_board_need_no_heap_no_output_and_no_double_on_a_cortex_m4(exports, tmp_path):
+    """All that they ask of a C library; double arithmetic would be functions of its own there."""
     export(exports.rendering("tones"), tmp_path)
-    parts = [f"{name}.o" for name in PARTS]
-    flags = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
-    subprocess.run(["make", "-s", "-C", tmp_path, f"CC={CROSS} {flags}", *parts], check=True)
-    command = [CROSS.replace("gcc", "nm"), "-g", *parts]
-    symbols = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    listed = [line.split() for line in symbols.splitlines()]
+    listed = m4_symbols(tmp_path, "-g")
+    assert {path.stem for path in tmp_path.glob("*.o")} == {*PARTS, *SOURCES} - {"plate", "hardware_posix"}
     defined = {words[-1] for words in listed if len(words) == 3}
     asked = {words[-1] for words in listed if len(words) == 2 and words[0] == "U"}
-    assert asked - defined <= {"memcpy", "memmove", "memset", "rintf", "sqrtf"}
+    hardware = set(re.findall(r"\bhardware_\w+", (FIRMWARE / "hardware.h").read_text(encoding="utf-8")))
+    assert asked - defined - hardware <= {"memcpy", "memmove", "memset", "rintf", "sqrtf", "cosf"}
+
+
+@pytest.mark.parametrize(
+    ("device", "bands"), [({}, 8), ({}, 64), ({"coils": 1}, 9), ({"delay": 3}, 8), ({"rate": 48e3, "delay": 40}, 8)]
+)
+def test_the_memory_of_a_board_is_what_design_h_states(tmp_path, device, bands):
+    """To the byte on a Cortex-M4, and with other textures; a board that takes more does not compile."""
+    cross_tools()
+    scene = hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=5e-6), duration=0.1, profile=device)
+    export(hr.prepare(scene, compiled=False), tmp_path, bands=bands)
+    (tmp_path / "size.c").write_text('#include "board.h"\nchar found[sizeof(board_t)], stated[BOARD_BYTES];\n')
+    for sizes in (), ("-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"):
+        compile_m4(tmp_path, "size.c", *sizes)
+        command = [CROSS.replace("gcc", "nm"), "-S", tmp_path / "size.o"]
+        listed = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+        found = {words[-1]: int(words[1], 16) for words in map(str.split, listed)}
+        assert found["found"] == found["stated"]
+        if not sizes:
+            assert f": {found['found']} with" in (tmp_path / "design.h").read_text(encoding="utf-8")
+    board = (tmp_path / "board.h").read_text(encoding="utf-8")
+    (tmp_path / "board.h").write_text(board.replace("} board_t;", "    real_t more[2];\n} board_t;"))
+    with pytest.raises(subprocess.CalledProcessError):
+        compile_m4(tmp_path, "size.c")
+
+
+def compile_m4(folder, source, *options):
+    subprocess.run(
+        [CROSS, *M4.split(), "-std=c99", *options, "-c", source], cwd=folder, check=True, capture_output=True
+    )
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +107,11 @@ def bank(count):
 
 
 def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles, 1.6 of them an instruction at most (benchmarks/board.py)."""
-    found = measured(built(tmp_path, bank(8), "measure-m4.elf"))
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles, 1.6 of them an instruction at most (benchmarks/board.py).
+
+    Under supervision, as a board plays.
+    """
+    found = measured(built(tmp_path, bank(8), "measure-m4.elf", "OPTIMISE=-O2 -funroll-loops -DSUPERVISED"))
     # the difference of two counts, of which each is that of two readings of a timer of 40 ns: two of 1/1.6
     assert found["nops"][0] == pytest.approx(1000.0, abs=1.26), "instructions are not what is counted"
     assert 1.6 * found["new"][0] < 168e6 / 5000 * 2 / 3

@@ -5,6 +5,7 @@ import doctest
 import graphlib
 import importlib
 import inspect
+import os
 import pkgutil
 import re
 import subprocess
@@ -85,7 +86,7 @@ GROUND = {
     f"hapticrender.{name}"
     for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "vectors", "mathx")
 }
-GROUND |= {f"hapticrender.{name}" for name in ("defaults", "driver_checks")}
+GROUND |= {f"hapticrender.{name}" for name in ("defaults", "devices", "driver_checks")}
 DEVICES = {"touch", "control", "plants"}
 MAY_IMPORT = {  # package: the others that it may import; renderers and drivers are found by their entry points
     "ground": set(),
@@ -374,3 +375,28 @@ def test_every_benchmark_finds_what_it_imports():
         except ModuleNotFoundError as error:
             if str(error.name).partition(".")[0] in ("benchmarks", "hapticrender", "tests"):
                 raise
+
+
+def test_every_test_that_the_page_on_safety_names_is_there():
+    """A name such as `..._the_peak_is_held_...` belongs to the file that is named last before it."""
+    names = None
+    for word in re.findall(r"`([^`\n]+)`", (ROOT / "docs" / "safety.md").read_text(encoding="utf-8")):
+        if found := re.fullmatch(r"(?:tests/)?(test_\w+)(?:\.py)?", word):
+            file = ROOT / "tests" / f"{found[1]}.py"
+            names = re.findall(r"^def (test_\w+)", file.read_text(encoding="utf-8"), re.MULTILINE)
+        elif word.startswith("..._"):
+            pattern = re.escape(word).replace(re.escape("..."), ".*")
+            assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
+
+
+@pytest.mark.parametrize(
+    ("there", "status", "said"), [({}, 0, "skipped"), ({"HAPTICRENDER_PACKAGES": "there"}, 1, "failed")]
+)
+def test_what_is_skipped_for_want_of_a_package_fails_where_all_are_there(there, status, said):
+    """As in `.ci/run`; here no program at all is found."""
+    environment = {name: value for name, value in os.environ.items() if name != "HAPTICRENDER_PACKAGES"}
+    command = [sys.executable, "-m", "pytest", "-q", "-k", "memory_of_a_board", ROOT / "tests" / "test_firmware_m4.py"]
+    options = {"env": environment | there | {"PATH": ""}, "cwd": ROOT, "capture_output": True, "text": True}
+    done = subprocess.run(command, **options, check=False)
+    assert done.returncode == status, done.stdout
+    assert f" {said}, " in done.stdout

@@ -7,14 +7,26 @@ from dataclasses import replace
 import board
 import numpy as np
 import pytest
-from board import FINGER, RATE, ROOT, SCENE, SteppedBoard, build_board, program_of, sensed_error, simulated_as, tones
+from board import (
+    FINGER,
+    MECHANICS,
+    RATE,
+    ROOT,
+    SCENE,
+    SteppedBoard,
+    build_board,
+    program_of,
+    sensed_error,
+    simulated_as,
+    tones,
+)
 
 import hapticrender as hr
 from hapticrender.cli import main
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind, Reason, State
 from hapticrender.drivers.serial import BoardClient, Line
-from hapticrender.errors import DeviceNotFound, DeviceTimeout, DriverError
+from hapticrender.errors import DeviceFault, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.plants.plate import PlateParameters
 
 ROUNDING = 2.0**-24  # relative, of float32
@@ -59,6 +71,43 @@ def test_a_scene_that_no_board_can_play_is_refused(stepped):
         hr.render(SCENE, driver=driver, method="h2")
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
         driver.play(np.zeros((1, 2)))
+
+
+PRESSED = hr.Scene(
+    texture=hr.Grating(frequency=189.0, amplitude=10e-6),
+    finger=hr.Finger.still(normal_load=0.8, mechanics=MECHANICS),
+    duration=0.5,
+)
+
+
+def test_the_limits_of_a_device_are_held_on_a_board(fast):
+    """A finger takes more than the free plate, by which a scene is refused: the drive is cut, or the board stops."""
+    free = hr.render(PRESSED, driver=fast.driver())
+    most, step = abs(free.drive).max(), 3.0 / 2**11
+    limit = 0.5 * most
+    assert limit > 3 * step  # of the converter, of which a peak is a multiple
+    recording = hr.render(replace(PRESSED, limits={"peak_drive": limit}), driver=fast.driver())
+    assert limit - step <= abs(recording.drive).max() <= limit
+    assert recording.read("flags").max() & hr.Flag.SATURATED
+    rms = np.sqrt((free.drive**2).mean(axis=0).max())  # of a tone: reached within some time constants
+    for limits, fault in (
+        ({"rms_drive": 0.5 * rms, "rms_time": 0.1}, "the mean square of the drive is above its limit"),
+        ({"displacement": 0.5 * abs(free.sensed).max()}, r"a sensor shows more than \[limits\] displacement"),
+    ):
+        with pytest.raises(DeviceFault, match=fault):
+            hr.render(replace(PRESSED, limits=limits), driver=fast.driver())
+        fast.assert_at_rest()
+
+
+def test_the_limits_of_a_device_are_held_live_on_a_board(fast):
+    driver = fast.driver()
+    limits = {"peak_drive": 0.5, "rms_drive": 0.25, "rms_time": 5e3, "displacement": 4e-4}
+    loop = driver.loop(hr.prepare(replace(PRESSED, limits=limits), driver=driver))
+    with driver:
+        loop.start()
+        peak, *others = driver.client._setup.limits
+    assert 0.5 - 3.0 / 2**11 < peak <= 0.5
+    assert others == [0.25, 1e3, 4e-4]
 
 
 def test_textures_gain_and_finger_change_while_it_plays(stepped):
@@ -142,10 +191,10 @@ def test_the_board_identifies_itself(tmp_path):
 
 
 def test_the_command_identifies_the_plate_of_a_board(fast, tmp_path, monkeypatch):
-    """By drive from the host; the profile has the delay of the board's own loop, for which a design is exported."""
+    """By drive from the host, within the board's limit; the profile has the delay of its own loop, for an export."""
     expected, path = PlateParameters(), tmp_path / "plate.toml"
     monkeypatch.setattr(board, "board_under_test", lambda: fast.driver(), raising=False)
-    command = ["identify", "--driver", "board:board_under_test", "--amplitude", "50e-6", "--out", str(path)]
+    command = ["identify", "--driver", "board:board_under_test", "--out", str(path)]
     assert main(command) == 0
     found = hr.DeviceProfile.load(path)
     assert found.device["delay"] == 1
@@ -191,6 +240,7 @@ def test_more_bands_than_a_frame_holds(tmp_path):
     program = build_board(tmp_path / "firmware", hr.prepare(SCENE), "-O1", "-DREAL_DOUBLE", bands=20)
     with SteppedBoard(tmp_path, program=program) as board:
         client = board.client().open()
+        client.limits(client.capabilities.drive_limit)  # a float, and in double perhaps above the limit itself
         client.set_bands(tones(*range(40, 340, 20), amplitude=1e-6))
         client.start()
         board.run(client, 0.1)

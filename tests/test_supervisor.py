@@ -317,9 +317,15 @@ def test_the_probe_passes_healthy_plates_under_any_finger(rng):
         assert max(plate.motion) < 50e-6
 
 
-def test_the_probe_can_be_switched_off_and_the_stop_cannot():
-    plate = Probed(sensors=-np.eye(2))
-    with pytest.raises(hr.DeviceFault, match="stopped at"):
-        hr.render(scene(rendering={"probe": False}), driver=plate)
+def test_the_probe_can_be_switched_off_and_the_stop_cannot(tmp_path):
+    """By a scene, and by a profile, before which comes what the scene says."""
+    hr.DeviceProfile(kind="vt-plate", probe=False).save(tmp_path / "plate.toml")
+    assert hr.DeviceProfile.load(tmp_path / "plate.toml").probe is False
+    profile = str(tmp_path / "plate.toml")
+    for fields in {"rendering": {"probe": False}}, {"device": profile}:
+        with pytest.raises(hr.DeviceFault, match="stopped at"):
+            hr.render(scene(**fields), driver=Probed(sensors=-np.eye(2)))
+    with pytest.raises(hr.DeviceFault, match="probe"):
+        hr.render(scene(device=profile, rendering={"probe": True}), driver=Probed(sensors=-np.eye(2)))
     with pytest.raises(TypeError, match="render.probe"):
         hr.prepare(scene(rendering={"probe": 0}))

@@ -41,12 +41,14 @@ void board_defaults(board_t *board)
     board->gain = REAL(1.0);
     board->peak = board->rms = design.drive_limit;
     board->heating = REAL(1.0) / design.rate;
+    board->displacement = supervision.sensed_bound;
 }
 
 void board_begin(board_t *board, board_state state)
 {
     law_init(&board->law, &board->played);
     supervisor_init(&board->supervisor, &supervision, &board->played);
+    board->supervisor.sensed_bound = board->displacement;
     (void)law_set_drive_limit(&board->law, board->peak);
     (void)law_set_gain(&board->law, board->gain);
     board->state = state;

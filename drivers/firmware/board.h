@@ -4,7 +4,7 @@
  * docs/protocol.md has every frame.  A set-point acts only after a COMMIT whose digest is that of what the board holds;
  * every command carries a CRC-32 that starts from the session, beside the frame's CRC-16.  Without a keep-alive for
  * 80 ms, or without a beat of the application for the time of its watchdog, the drive fades out within 10 ms.  Static
- * memory: sizeof(board_t), no heap, no recursion.
+ * memory: BOARD_BYTES of design.h, no heap, no recursion.
  */
 #ifndef BOARD_H
 #define BOARD_H
@@ -18,7 +18,7 @@
 #include "texture.h"
 
 enum {
-    BOARD_VERSION = 3,
+    BOARD_VERSION = 4,
     BOARD_SILENCE_MS = 80,                        /* without a keep-alive (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
@@ -90,6 +90,7 @@ typedef struct {
     uint32_t committed;                           /* 1: this session has set-points */
     real_t gain;
     real_t peak, rms, heating, heat;              /* A, A, pole a sample, A^2 */
+    real_t displacement;                          /* m: bound of a sensor */
     real_t fade, fade_step, fade_to;
     uint32_t invalid;                             /* samples in a row */
     line_t lines[BOARD_LINES];
@@ -110,6 +111,10 @@ typedef struct {
     size_t sending_in, sending_out;
     textures_t textures;                          /* last, as they are large */
 } board_t;
+
+/* Does not compile where a board takes more than design.h states; pointers and size_t of 8 bytes, and double, may. */
+typedef char board_bytes_hold[sizeof(board_t) <= BOARD_BYTES * (sizeof(real_t) / 4u) + 16u * (sizeof(void *) - 4u)
+                                  ? 1 : -1];
 
 /* Set the board to rest, as after a reset. */
 void board_init(board_t *board);

@@ -69,13 +69,15 @@ static uint8_t gain(board_t *board, const frame *from)
 
 static uint8_t limits(board_t *board, const frame *from)
 {
-    real_t peak = (real_t)get_f32(from->payload), rms = (real_t)get_f32(from->payload + 4), time = (real_t)get_f32(from->payload + 8);
-    if (!(peak > REAL(0.0) && peak <= design.drive_limit && rms > REAL(0.0) && rms <= peak && time >= REAL(1e-3) &&
-          time <= REAL(1e3))) {
+    real_t peak = (real_t)get_f32(from->payload), rms = (real_t)get_f32(from->payload + 4);
+    real_t time = (real_t)get_f32(from->payload + 8), displacement = (real_t)get_f32(from->payload + 12);
+    if (!(peak > REAL(0.0) && peak <= (real_t)(float)design.drive_limit && rms > REAL(0.0) && rms <= peak &&
+          time >= REAL(1e-3) && time <= REAL(1e3) && displacement > REAL(0.0))) {
         return REASON_VALUE;
     }
-    board->peak = peak;
+    board->peak = peak = real_min(peak, design.drive_limit);    /* the host knows it as a float */
     board->rms = rms;
+    board->displacement = board->supervisor.sensed_bound = real_min(displacement, supervision.sensed_bound);
     board->heating = real_min(REAL(1.0) / (time * board->played.rate), REAL(1.0));
     (void)law_set_drive_limit(&board->law, peak);
     return REASON_NONE;
@@ -262,7 +264,7 @@ static const struct {
     handler handle;
 } commands[] = {
     {KIND_SETPOINT, 1 + SETPOINT_BYTES, 0, setpoint}, {KIND_COMMIT, 5, 0, commit}, {KIND_GAIN, 4, 0, gain},
-    {KIND_LIMITS, 12, 0, limits}, {KIND_START, 4, 0, start}, {KIND_STOP, 0, 0, stop},
+    {KIND_LIMITS, 16, 0, limits}, {KIND_START, 4, 0, start}, {KIND_STOP, 0, 0, stop},
     {KIND_LINE, 1 + LINE_BYTES, 0, line}, {KIND_IDENTIFY, 11, 0, identify}, {KIND_DRIVE, 4, ROW_BYTES, drive},
     {KIND_TEXTURE, 16, 0, board_texture}, {KIND_PROFILE, 2, 2, board_profile}, {KIND_SAMPLES, 9, 2, board_samples},
     {KIND_PLAY, 4, 0, board_play},

@@ -18,6 +18,7 @@ void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const 
     (void)memset(supervisor, 0, sizeof(*supervisor));
     supervisor->p = used;
     supervisor->design = played;
+    supervisor->sensed_bound = used->sensed_bound;
     supervisor->fade = REAL(1.0);
 }
 
@@ -89,7 +90,7 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
         } else {
             /* it moves */
         }
-        if ((size < d->sensor_limit) && (size > s->p->sensed_bound)) {
+        if ((size < d->sensor_limit) && (size > s->sensed_bound)) {
             beyond |= 1u << i;
         }
         s->input[0] += d->coordinate_from_sensor[0][i] * s->last[i];

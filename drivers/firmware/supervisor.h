@@ -66,6 +66,7 @@ typedef struct {
     real_t drive_energy[LAW_CHANNELS], heat[LAW_CHANNELS];
     real_t last[LAW_SENSORS], least[LAW_SENSORS], most[LAW_SENSORS];
     real_t fade, fade_step, invalid, peak;
+    real_t sensed_bound;             /* m: that of the settings, or a lower one */
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
     uint32_t beyond_count, suspended, at, started;

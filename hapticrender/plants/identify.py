@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.checks import require
+from hapticrender.devices import naming_driver, open_driver, registered
 from hapticrender.driver_checks import check_channels, check_driver, check_sensed
 from hapticrender.errors import DesignError, PlateMismatch
 from hapticrender.plants.fitting import (
@@ -40,8 +41,9 @@ from hapticrender.plants.fitting import (
     variances,
 )
 from hapticrender.plants.multisine import Multisine, design_multisine
-from hapticrender.plants.plate import PlateParameters
+from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Array, Driver, Flag, Sensed
+from hapticrender.touch.finger import Finger
 
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
 UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
@@ -200,7 +202,7 @@ def compare(found: Identified, designed: PlateParameters) -> tuple[Difference, .
 
 
 def identify(
-    driver: Driver,
+    driver: Driver | str,
     parameters: PlateParameters,
     *,
     seconds: float = 1.0,
@@ -211,12 +213,12 @@ def identify(
 ) -> Identified:
     """Identify the free plate behind a driver from the response to a multi-sine.
 
-    The driver must be open, so call this inside its ``with`` statement; it stays open, at zero drive.
+    A driver must be open, so call this inside its ``with`` statement; it stays open, at zero drive.
 
     Parameters
     ----------
-    driver : Driver
-        Any driver of a plate: two coils, two sensors.
+    driver : Driver or str
+        Any driver of a plate: two coils, two sensors; or a text as ``--driver`` takes it, opened and closed here.
     parameters : PlateParameters
         Expected plate; electronics, geometry, the mean of the sensor gains and the modal mass of a bending mode, which
         only scales its shape at the coils, are taken as given.
@@ -224,7 +226,7 @@ def identify(
         Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s:
         delays up to wait - 0.05 s are identified.
     amplitude : float, m, > 0
-        Largest displacement of a glass end, on the expected plate.
+        Largest displacement of a glass end, on the expected plate; less where the driver's `drive_limit` allows less.
     contact : float, N, > 0
         Bound of the static load.
     unexplained : float, > 0
@@ -251,10 +253,20 @@ def identify(
 
     Errors of the model show in `misfit`: a command of 10 bits taken for 12 leaves 1 % of the motion.
     """
+    if isinstance(driver, str):
+        options = {"wait": wait, "amplitude": amplitude, "contact": contact, "unexplained": unexplained}
+        made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
+        made = made.driven_by_host() if hasattr(made, "driven_by_host") else made
+        with naming_driver(driver), made as opened:
+            found = identify(opened, parameters, seconds=seconds, **options)
+        return found.shortened(getattr(made, "host_delay", 0))
     rate = float(driver.rate)
     samples = _samples(driver, parameters, seconds, wait)
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
+    if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
+        amplitude *= (limit - parameters.current_step) / peak
+        sine = design_multisine(parameters, rate, samples, amplitude)
     start, fade = round(wait * rate), round(RAMP * rate)
     sensed = play(driver, _whole_drive(sine, start, fade)).sensed[start : start + samples]
     _check_range(sensed, parameters)

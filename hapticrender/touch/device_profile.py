@@ -15,7 +15,7 @@ from hapticrender.errors import naming
 from hapticrender.touch import toml
 
 ENDING = ".toml"  # of a device's name that is a file
-HEAD = ("kind", "name", "measured_by", "measured_with", "measured_on")  # the table [profile] of a file
+HEAD = ("kind", "name", "measured_by", "measured_with", "measured_on", "probe")  # the table [profile] of a file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class DeviceProfile(Validated):
     """All that is known of one device, and where it comes from; a TOML file.
 
     A scene takes it by the file's name (``Scene(device="plate.toml")``); `hapticrender identify` writes one.  In a file
-    the first five are the table ``[profile]``, the others a table of their name each.
+    the first six are the table ``[profile]``, the others a table of their name each.
 
     Examples
     --------
@@ -106,6 +106,7 @@ class DeviceProfile(Validated):
     measured_by: str = checked(checks.text, "", about="who measured it")
     measured_with: str = checked(checks.text, "", about="with what")
     measured_on: date | None = checked(_day, None, about='when, also as a text "2026-11-22"')
+    probe: bool = checked(checks.flag, True, about="whether a plate is probed before the loop closes")
     device: Mapping[str, Any] = mapping(_parameters, "parameters (number, str or bool), as in a scene's ``[device]``")
     uncertainty: Mapping[str, float] = mapping(_uncertainty, "standard uncertainty of parameters, in their units")
     calibration: Calibration = checked(_part, Calibration(), about="also as a table", kind=Calibration)
@@ -146,7 +147,7 @@ class DeviceProfile(Validated):
 
     def to_toml(self) -> str:
         """TOML text that `from_table` reads back to an equal profile."""
-        head = {key: getattr(self, key) for key in HEAD if getattr(self, key)}
+        head = {key: getattr(self, key) for key in HEAD if getattr(self, key) not in ("", None, True)}
         tables = {"profile": head, "device": self.device, "uncertainty": self.uncertainty}
         tables |= {"calibration": table_of(self.calibration), "limits": table_of(self.limits)}
         return toml.dumps({key: table for key, table in tables.items() if table}).lstrip("\n")

@@ -173,6 +173,7 @@ class Scene(Validated):
             found = DeviceProfile.load(self.device)
             limits, calibration = table_of(found.limits), table_of(found.calibration)
             tables = {"profile": found.device, "limits": limits, "calibration": calibration}
+            tables["rendering"] = {} if found.probe else {"probe": False}
             merged = {name: {**table, **_read_table(name, getattr(self, name))} for name, table in tables.items()}
             checks.keep(self, device=found.kind, source=self.source or str(found), **merged)
         super().__post_init__()
