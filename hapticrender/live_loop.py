@@ -81,7 +81,7 @@ class LiveLoop(RealtimeEntry):
     """
 
     def __init__(self, rendering: Rendering, **scales: float) -> None:
-        super().__init__(live_controller(rendering), **scales)
+        super().__init__(live_controller(rendering), frames=rendering.driver.block, **scales)
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         rows = len(self._arrays["log"])

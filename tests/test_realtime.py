@@ -166,6 +166,20 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     np.testing.assert_allclose(log["reference"][settled], expected[settled], rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("frames", [1, 64])
+def test_the_log_has_the_drive_of_the_call_before(frames, rng):
+    """Over two seconds and more, of which the log has all but nine samples."""
+    entry = RealtimeEntry(designed(False, True), frames=frames)
+    entry.play(SampledTexture(wave(False), RATE))
+    sensed = 1e-7 * rng.standard_normal((11_008, 2))
+    calls = [plain(entry, each)[0] for each in sensed.reshape(-1, frames, 2)]
+    log, played = entry.log(0), np.concatenate([np.zeros((frames, 2)), *calls])[: len(sensed)]
+    first = int(log["first"])
+    assert 0 < first <= len(sensed) - 2 * RATE + 8
+    np.testing.assert_array_equal(log["drive"], played[first:])
+    np.testing.assert_array_equal(log["sensed"], sensed[first:])
+
+
 def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_time_goes_on():
     n = round((HOLD + 0.2) * RATE)
     for texture, goes_on in ((wave(False), True), (wave(True), False)):

@@ -316,6 +316,7 @@ DRIVERS = [
     (lambda: rendered(driver=SimulatedDriver), "driver = SimulatedDriver: must be an instance, not the class"),
     (lambda: protocol.encode(protocol.Frame(1, 0, bytes(250))), "payload of 250 bytes: must be <= 249"),
     (lambda: RealtimeEntry(object()), "controller of type object: must have a compiled step"),
+    (lambda: RealtimeEntry(in_blocks(), frames=64), "frames = 64: must be a multiple of the controller's block of 25"),
     (lambda: entry().finger(0.0, np.nan), "must be finite"),
     (lambda: entry().set_gain(np.nan), "gain = nan"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
