@@ -35,7 +35,8 @@ from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 CHUNK = 0.25  # s of signal between two writes of the journal
-GUARDED: list[None] = []  # an entry for each run that SIGTERM is to end by an exception
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows: one
+GUARDED: list[None] = []  # an entry for each run that one of these is to end by an exception
 
 Progress = Callable[[float, float], None]
 
@@ -130,7 +131,8 @@ def render(
 def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
     """Play a prepared rendering to its end; see `render`.
 
-    However it ends (an error, Ctrl-C, SIGTERM), every sample played is recorded and the device is left at zero drive.
+    However it ends (an error, Ctrl-C, SIGTERM, SIGHUP), every sample played is recorded and the device is left at zero
+    drive.
     """
     driver, total = rendering.driver, rendering.samples
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
@@ -140,7 +142,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             recorder.append(**signals)
 
     device = rendering.device
-    with opened_once(device), recorder, stopped_by_sigterm(), driver, zero_drive_after(device):
+    with opened_once(device), recorder, stopped_by_signal(), driver, zero_drive_after(device):
         if rendering.probe:
             probe_plate(device, rendering.model)
         loop, fault = _Loop(rendering), None
@@ -236,7 +238,7 @@ def _warm_up(rendering: Rendering) -> None:
 
 
 class Terminated(SystemExit):
-    """SIGTERM: ends the process by an exception, so that devices are left at rest."""
+    """SIGTERM or SIGHUP: ends the process by an exception, so that devices are left at rest."""
 
 
 def _end(number: int, frame: object) -> None:
@@ -244,20 +246,26 @@ def _end(number: int, frame: object) -> None:
 
 
 @contextmanager
-def stopped_by_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into `Terminated` in the main thread: devices are left at rest; may be nested or overlap."""
+def stopped_by_signal() -> Iterator[None]:
+    """Turn `ENDING` into `Terminated` in the main thread: devices are left at rest; may be nested or overlap.
+
+    A signal that somebody else handles, or that `nohup` ignores, is left alone.
+    """
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, _end):
+    ours = [each for each in ENDING if main and signal.getsignal(each) in (signal.SIG_DFL, _end)]
+    if not ours:
         yield
         return
-    signal.signal(signal.SIGTERM, _end)
+    for each in ours:
+        signal.signal(each, _end)
     GUARDED.append(None)
     try:
         yield
     finally:
         GUARDED.pop()
-        if not GUARDED:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for each in ENDING if not GUARDED else ():
+            if signal.getsignal(each) is _end:
+                signal.signal(each, signal.SIG_DFL)
 
 
 @contextmanager

@@ -37,7 +37,7 @@ from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_sigterm, zero_drive_after
+from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
@@ -368,7 +368,7 @@ class Player:
         if self._given is None and rendering.plant is not None:
             self._motion.attach(rendering)
         stack.enter_context(opened_once(device))
-        stack.enter_context(stopped_by_sigterm())
+        stack.enter_context(stopped_by_signal())
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
         stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
