@@ -15,6 +15,7 @@ Where the controller works by bands (hybrids) each texture has one, which goes o
 
 from __future__ import annotations
 
+import atexit
 import math
 import threading
 import time
@@ -135,12 +136,16 @@ class Player:
 
     def __enter__(self) -> Self:
         self._entered = True
+        atexit.register(self.__exit__, None, None, None)  # where the program ends before its `with` does
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
+        atexit.unregister(self.__exit__)
+        if not self._entered:  # a generator's `with`, after the program's end
+            return
         with ExitStack() as last:  # from the last to the first, whatever fails
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened

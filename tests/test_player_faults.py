@@ -296,6 +296,38 @@ def test_a_device_that_does_not_start_is_left_closed():
         assert player.time >= 0.2
 
 
+LEFT = """
+import sys
+import hapticrender as hr
+from live_devices import TONE
+from test_faults import logged
+def session():
+    player = hr.Player(driver=logged(sys.argv[1]), paced={paced})
+    {enter}
+        player.play(TONE)
+        player.record(sys.argv[2])
+        player.sleep(0.3)
+        yield player
+sys.held = session()  # longer than this module, at whose end it would be closed
+kept = next(sys.held)
+"""
+
+
+@pytest.mark.parametrize("paced", [True, False])
+@pytest.mark.parametrize("enter", ["with player:", "if player.__enter__():"])
+def test_a_program_that_ends_before_its_with_statement_leaves_zero_drive(enter, paced, tmp_path):
+    """A generator that waits in one, or an application that has entered by hand; the journal is whole."""
+    played, journal = tmp_path / "played", tmp_path / "journal.au"
+    paths = {"PYTHONPATH": os.pathsep.join((os.getcwd(), os.path.dirname(__file__)))}
+    command = [sys.executable, "-c", LEFT.format(paced=paced, enter=enter), played, journal]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, env=os.environ | paths)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    drive = np.fromfile(played).reshape(-1, 25, 2)
+    assert drive[:-2].any()
+    assert not drive[-1].any()
+    assert len(Recording.load(journal)) >= 1500
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
 @pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, status):
