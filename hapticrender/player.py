@@ -36,6 +36,7 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, hold_to_clock
 from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
@@ -59,7 +60,7 @@ POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; o
 TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
-class Player:
+class Player(Addressed):
     """Plays textures on a device while the application goes on; used in a `with` statement.
 
     Its methods may be called from any thread; `finger` never waits for the others.
@@ -90,6 +91,8 @@ class Player:
     ValueError, TypeError
         An argument is out of its bound.
     """
+
+    _held = "a device and threads"
 
     def __init__(
         self,

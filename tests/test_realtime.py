@@ -2,6 +2,7 @@
 
 import copy
 import ctypes
+import pickle
 import sys
 import time
 from dataclasses import replace
@@ -340,12 +341,12 @@ def test_slots_change_hands_whole():
         assert found.result(60) == (0, 0)
 
 
-def test_what_holds_addresses_is_not_copied():
-    """A copy would read and write the memory of the first."""
+def test_what_holds_addresses_or_a_device_is_not_copied():
+    """A copy would read and write the memory of the first, or play on its device."""
     bank, scenes = controller(), hr.builtin_scenes()
     texture = SampledTexture(hr.Grating(frequency=72.0, amplitude=1e-5), 5000.0)
     own = [hr.prepare(scenes[name], compiled=False).controller() for name in ("grating-72", "one-texture-hybrid")]
-    for each in (bank, RealtimeEntry(bank), texture, *own):
-        for duplicate in (copy.copy, copy.deepcopy):
+    for each in (bank, RealtimeEntry(bank), texture, hr.Player(), *own):
+        for duplicate in (copy.copy, copy.deepcopy, pickle.dumps):
             with pytest.raises(TypeError, match=rf"^{type(each).__name__}: cannot be copied or pickled"):
                 duplicate(each)
