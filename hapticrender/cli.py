@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(arguments: argparse.Namespace) -> int:
-    """Run a verb; what ends the program within, other than SIGTERM, is an error, whatever status it gives."""
+    """Run a verb; what ends the program within, other than a signal, is an error, whatever status it gives."""
     try:
         return arguments.run(arguments)  # type: ignore[no-any-return]
     except SystemExit as error:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -13,10 +12,12 @@ import numpy as np
 
 from hapticrender.checks import require
 from hapticrender.errors import ProtocolError
-from hapticrender.protocols import Array, Sensed
+from hapticrender.protocols import Array, Flag, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
+MOST_RATE = 1e7  # Hz: of the fastest device that parameters can state; filters and logs take memory by it
+FLAGS = sum(Flag)  # all bits
 OPEN: set[int] = set()  # identities of the devices that play
 
 
@@ -41,8 +42,8 @@ def check_driver(driver: Any) -> None:
     if missing:
         raise TypeError(f"{kind} is no driver: it lacks {', '.join(missing)}")
     rate = driver.rate
-    if not isinstance(rate, Real) or not 0.0 < float(rate) < math.inf:
-        raise ValueError(f"{kind}: rate={rate!r} must be finite and > 0 Hz")
+    if not isinstance(rate, Real) or not 0.0 < float(rate) <= MOST_RATE:
+        raise ValueError(f"{kind}: rate={rate!r} must be finite and > 0 Hz, and <= {MOST_RATE:g} Hz")
     for name, least in (*_LEAST.items(), ("delay", driver.block)):
         value = getattr(driver, name)
         if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
@@ -57,12 +58,15 @@ def check_channels(driver: Any, drive: Mapping[int, str], sensed: Mapping[int, s
         require(found in known, f"driver.{name}", found, bound)
 
 
-def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
+def check_sensed(driver: Any, sensed: Sensed, places: int, stated: bool = False) -> Sensed:
     """Return a block that `driver` returned with copies of its columns, contiguous float64 (flags int64).
 
-    A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns.
+    A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns,
+    and may not be missing once it was `stated`: a recording has one source of it.
     """
-    block = driver.block
+    block, kind = driver.block, type(driver).__name__
+    if not hasattr(sensed, "sensed"):
+        raise ProtocolError(f"{kind}: play returned {type(sensed).__name__}: must return a hapticrender.Sensed")
     shapes = {
         "sensed": (block, driver.sensed_channels),
         "position": (block,),
@@ -76,6 +80,8 @@ def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
         if value is None and name != "sensed":
             continue
         columns[name] = _column(driver, name, value, shape)
+    if stated and "motion" not in columns:
+        raise ProtocolError(f"{kind}: play: motion is None, and was stated before: must be stated in every block")
     return Sensed(**columns)
 
 
@@ -94,4 +100,6 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
         raise ProtocolError(f"{where} is no array of {'whole ' * (kind is np.int64)}numbers: {error}") from None
     if given.shape != shape:
         raise ProtocolError(f"{where} has shape {given.shape}, must be {shape}")
+    if kind is np.int64 and (unknown := int(np.bitwise_or.reduce(column)) & ~FLAGS):
+        raise ProtocolError(f"{where} has bits {unknown}, must be of hapticrender.Flag, 0 to {FLAGS}")
     return column

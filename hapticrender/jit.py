@@ -222,10 +222,12 @@ def record_of(dtype: np.dtype[Any], *sources: object, **values: Any) -> np.ndarr
 
 
 class Addressed:
-    """Base of what holds addresses of arrays of its own, which a copy would read and write, too."""
+    """Base of what holds addresses of arrays of its own, or what else `_held` says, which a copy would use, too."""
+
+    _held = "addresses"
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
-        raise TypeError(f"{type(self).__name__}: cannot be copied or pickled, it holds addresses: make a new one")
+        raise TypeError(f"{type(self).__name__}: cannot be copied or pickled, it holds {self._held}: make a new one")
 
 
 def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:

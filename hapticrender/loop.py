@@ -35,7 +35,8 @@ from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 CHUNK = 0.25  # s of signal between two writes of the journal
-GUARDED: list[None] = []  # an entry for each run that SIGTERM is to end by an exception
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows: one
+GUARDED: list[None] = []  # an entry for each run that one of these is to end by an exception
 
 Progress = Callable[[float, float], None]
 
@@ -130,7 +131,8 @@ def render(
 def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
     """Play a prepared rendering to its end; see `render`.
 
-    However it ends (an error, Ctrl-C, SIGTERM), every sample played is recorded and the device is left at zero drive.
+    However it ends (an error, Ctrl-C, SIGTERM, SIGHUP), every sample played is recorded and the device is left at zero
+    drive.
     """
     driver, total = rendering.driver, rendering.samples
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
@@ -140,7 +142,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             recorder.append(**signals)
 
     device = rendering.device
-    with opened_once(device), recorder, stopped_by_sigterm(), driver, zero_drive_after(device):
+    with opened_once(device), recorder, stopped_by_signal(), driver, zero_drive_after(device):
         if rendering.probe:
             probe_plate(device, rendering.model)
         loop, fault = _Loop(rendering), None
@@ -236,7 +238,7 @@ def _warm_up(rendering: Rendering) -> None:
 
 
 class Terminated(SystemExit):
-    """SIGTERM: ends the process by an exception, so that devices are left at rest."""
+    """SIGTERM or SIGHUP: ends the process by an exception, so that devices are left at rest."""
 
 
 def _end(number: int, frame: object) -> None:
@@ -244,20 +246,26 @@ def _end(number: int, frame: object) -> None:
 
 
 @contextmanager
-def stopped_by_sigterm() -> Iterator[None]:
-    """Turn SIGTERM into `Terminated` in the main thread: devices are left at rest; may be nested or overlap."""
+def stopped_by_signal() -> Iterator[None]:
+    """Turn `ENDING` into `Terminated` in the main thread: devices are left at rest; may be nested or overlap.
+
+    A signal that somebody else handles, or that `nohup` ignores, is left alone.
+    """
     main = threading.current_thread() is threading.main_thread()
-    if not main or signal.getsignal(signal.SIGTERM) not in (signal.SIG_DFL, _end):
+    ours = [each for each in ENDING if main and signal.getsignal(each) in (signal.SIG_DFL, _end)]
+    if not ours:
         yield
         return
-    signal.signal(signal.SIGTERM, _end)
+    for each in ours:
+        signal.signal(each, _end)
     GUARDED.append(None)
     try:
         yield
     finally:
         GUARDED.pop()
-        if not GUARDED:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        for each in ENDING if not GUARDED else ():
+            if signal.getsignal(each) is _end:
+                signal.signal(each, signal.SIG_DFL)
 
 
 @contextmanager
@@ -299,7 +307,7 @@ class _Loop:
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
-        self._late = 0.0  # samples after which it is
+        self._late, self._has_motion = 0.0, False  # samples after which it is; whether the device states it
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -343,7 +351,9 @@ class _Loop:
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
         driver, played = self.rendering.driver, self._drive
-        sensed = check_sensed(driver, driver.play(played.copy()), len(self.rendering.model.places))
+        places = len(self.rendering.model.places)
+        sensed = check_sensed(driver, driver.play(played.copy()), places, self._has_motion)
+        self._has_motion = sensed.motion is not None
         self._itself |= stops_itself(sensed, self.controller)
         position = sensed.position
         if position is None:

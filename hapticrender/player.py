@@ -15,6 +15,7 @@ Where the controller works by bands (hybrids) each texture has one, which goes o
 
 from __future__ import annotations
 
+import atexit
 import math
 import threading
 import time
@@ -35,9 +36,10 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_sigterm, zero_drive_after
+from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
@@ -58,7 +60,7 @@ POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; o
 TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up
 
 
-class Player:
+class Player(Addressed):
     """Plays textures on a device while the application goes on; used in a `with` statement.
 
     Its methods may be called from any thread; `finger` never waits for the others.
@@ -89,6 +91,8 @@ class Player:
     ValueError, TypeError
         An argument is out of its bound.
     """
+
+    _held = "a device and threads"
 
     def __init__(
         self,
@@ -135,12 +139,16 @@ class Player:
 
     def __enter__(self) -> Self:
         self._entered = True
+        atexit.register(self.__exit__, None, None, None)  # where the program ends before its `with` does
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
+        atexit.unregister(self.__exit__)
+        if not self._entered:  # a generator's `with`, after the program's end
+            return
         with ExitStack() as last:  # from the last to the first, whatever fails
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened
@@ -368,7 +376,7 @@ class Player:
         if self._given is None and rendering.plant is not None:
             self._motion.attach(rendering)
         stack.enter_context(opened_once(device))
-        stack.enter_context(stopped_by_sigterm())
+        stack.enter_context(stopped_by_signal())
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
         stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))

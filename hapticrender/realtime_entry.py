@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import number
+from hapticrender.checks import number, require
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
@@ -73,6 +73,8 @@ class RealtimeEntry(Addressed):
         Unit of a float sample of 1.0 at the input.
     drive_scale : float, 1/A of full scale, > 0
         Float sample at the output for a drive of 1 A.
+    frames : int, samples, optional
+        Of a call, a multiple of the controller's block, which it is unless given; `log` needs it.
 
     Attributes
     ----------
@@ -89,16 +91,21 @@ class RealtimeEntry(Addressed):
     TypeError
         The controller has no compiled step.
     ValueError
-        A scale is out of its bound.
+        A scale is out of its bound, or `frames` is no multiple of the block.
     """
 
-    def __init__(self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0) -> None:
+    def __init__(
+        self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0, frames: int | None = None
+    ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
         number("sensed_scale", sensed_scale, "m", above=0.0)
         number("drive_scale", drive_scale, "1/A", above=0.0)
         self.controller = controller
         self.block, self.rate = controller.block, float(controller.rate)
+        self.frames = self.block if frames is None else frames
+        bound = f"a multiple of the controller's block of {self.block} samples"
+        require(self.frames > 0 and self.frames % self.block == 0, "frames", frames, bound)
         self.whole = controller.bands.envelope is None
         self._slot, self._slots, self._back = np.zeros(1, SLOT), np.zeros(SLOTS, SLOT), 0
         self._slot["position"], self._slot["playing"], self._slot["gain"] = np.nan, 1, 1.0
@@ -118,7 +125,7 @@ class RealtimeEntry(Addressed):
     def _buffers(self) -> dict[str, Array]:
         """Signals of a block, gains that wait, and the log."""
         controller, block = self.controller, self.block
-        rows = -(-round(LOG_TIME * self.rate) // block) * block
+        rows = -(-round(LOG_TIME * self.rate) // block) * block + self.frames
         return {
             "sensed": np.zeros((block, controller.sensors)),
             "drive": np.zeros((block, controller.channels)),
@@ -262,10 +269,10 @@ class RealtimeEntry(Addressed):
         normal_load (N), reference (the whole texture) and flags, each shape (n,).
         """
         table, end = self._arrays["log"], self.samples
-        first = max(start, end - len(table) + 8 * self.block, 0)
+        first = max(start, end - len(table) + 8 * self.block + self.frames, 0)
         rows = table[np.arange(first, end) % len(table)]
         c, s = self.controller.channels, self.controller.sensors
-        played = np.arange(first, end) - self.block  # a block's drive plays with the next one
+        played = np.arange(first, end) - self.frames  # the drive of a call plays with the samples of the next one
         drive = np.where(played[:, None] < 0, 0.0, table[played % len(table), :c])
         position, load, reference, flags = rows[:, c + s :].T
         found = {"drive": drive, "sensed": rows[:, c : c + s], "position": position, "normal_load": load}

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from synthetic import make_bands
 from waves import Own
 
 import hapticrender as hr
+from hapticrender.loop import ENDING, _end, stopped_by_signal
 
 RATE = 5000.0
 TESTS = Path(__file__).resolve().parent
@@ -84,8 +86,8 @@ def scene(frequency=72.0, amplitude=20e-6, duration=1.0, **fields):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, name, status):
     """The command line on a device of one's own: what it was played last is zero, and the journal can be read."""
     log, out = tmp_path / "played", tmp_path / "out"
     (tmp_path / "long.toml").write_text(scene(duration=600.0).to_toml())
@@ -93,7 +95,9 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     command += ["--driver", f"test_faults:logged:{log}"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     paths = {"PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS.parent)))}
-    with subprocess.Popen(command, **pipes, env=os.environ | paths) as child:
+    number = getattr(signal, name)
+    default = partial(signal.signal, number, signal.SIG_DFL)  # also where whoever runs the tests ignores it
+    with subprocess.Popen(command, **pipes, env=os.environ | paths, preexec_fn=default) as child:
         end = time.monotonic() + 120
         while not (log.exists() and log.stat().st_size > 16 * RATE):  # a second of both coils
             assert child.poll() is None, child.communicate()
@@ -102,7 +106,7 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
         child.send_signal(number)
         _, errors = child.communicate(timeout=120)
     assert child.returncode == status, errors
-    assert number != signal.SIGINT or "hapticrender: interrupted; what is written so far can be read" in errors
+    assert name != "SIGINT" or "hapticrender: interrupted; what is written so far can be read" in errors
     drive = np.fromfile(log).reshape(-1, 25, 2)
     assert drive[:-1].any()
     assert not drive[-1].any()
@@ -113,8 +117,25 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, number, status):
     np.testing.assert_array_equal(stopped(recording), drive.reshape(-1, 2)[: len(recording) - 1])
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signal on this system")
+def test_a_signal_that_is_ignored_or_handled_stays_so():
+    """`nohup` ignores SIGHUP before the program starts; an application may handle it."""
+    for own in (signal.SIG_IGN, lambda *given: None):
+        before = {each: signal.signal(each, given) for each, given in zip(ENDING, (signal.SIG_DFL, own), strict=True)}
+        try:
+            with stopped_by_signal(), stopped_by_signal():
+                assert signal.getsignal(signal.SIGTERM) is _end
+                assert signal.getsignal(signal.SIGHUP) is own
+            assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+            assert signal.getsignal(signal.SIGHUP) is own
+        finally:
+            for each, handler in before.items():
+                signal.signal(each, handler)
+
+
 def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
-    """Ctrl-C while the reference of a tone is computed for the journal; SIGTERM is left as it was before."""
+    """Ctrl-C while the reference of a tone is computed for the journal; signals are left as they were before."""
+    before = [signal.getsignal(each) for each in ENDING]
     came = []
 
     def waveform(at, position):
@@ -126,7 +147,8 @@ def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
     plate, texture = Logged(block=25, told=25, delay=25), Own(waveform, bands=make_bands(72.0, 20e-6))
     with pytest.raises(KeyboardInterrupt):
         hr.render(hr.Scene(texture=texture, duration=2.0), driver=plate, journal=tmp_path / "run.au")
-    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    assert [signal.getsignal(each) for each in ENDING] == before
+    assert _end not in before
     played = np.concatenate(plate.played)
     recording = hr.Recording.load(tmp_path / "run.au")
     np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from live_devices import RIDGES, TONE, Blind, Calling, Lying, slide
+from strangers_plate import StrangersPlate
+from test_two_touches import HEAVY
 
 import hapticrender as hr
 from hapticrender import live_threads, sampled_texture
@@ -127,6 +129,56 @@ def test_a_recording_has_the_drive_that_played_with_each_sample(tmp_path):
         played = np.concatenate(driver.played)[: len(live)]
     assert abs(played).max() > 0.01
     np.testing.assert_array_equal(live.drive, played)
+
+
+class Kept(StrangersPlate):
+    """In blocks of 10 at 5 kHz, each acting a block later still, under a heavy finger from 0.3 s on."""
+
+    def __init__(self):
+        self.place, self.handed, self.sensed = hr.Finger.swiping(1.0, speed=0.1).position, [], []
+        touch = {"finger": HEAVY, "load": 0.4, "contact": lambda time: 1.0 * (time > 0.3), "position": self.place}
+        super().__init__(block=10, told=20, delay=11, **touch)
+
+    def play(self, drive):
+        found = super().play(drive)
+        self.handed.append(drive.copy())
+        self.sensed.append(found.sensed)
+        return found
+
+
+@pytest.mark.parametrize("live", [True, False])
+@pytest.mark.parametrize("method", ["inverse", "h2"])
+def test_a_recording_has_the_drive_that_was_handed_over_with_each_block(method, live, tmp_path):
+    """A law by samples and one in blocks, live and by `render`; out of step, one finger would pass for two."""
+    driver = Kept()
+    if live:
+        with hr.Player(driver=driver, paced=False, method=method) as player:
+            player.play(TONE)
+            player.record(tmp_path / "live.au")
+            player.sleep(1.5)
+            recording = player.end_recording()
+    else:
+        recording = hr.render(hr.Scene(texture=TONE, duration=1.5, method=method), driver=driver)
+    assert len(recording) == 7500
+    handed, sensed = (np.concatenate(each)[: len(recording)] for each in (driver.handed, driver.sensed))
+    assert abs(handed).max() > 0.01
+    np.testing.assert_array_equal(recording.sensed, sensed)
+    np.testing.assert_array_equal(recording.drive, handed)
+    assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
+
+
+def test_the_log_of_a_device_that_calls_back_has_the_drive_that_was_handed_over():
+    """To half a unit in the last place of a float of 24 bits: a law by samples behind blocks of 64."""
+    device, handed = Calling(), []
+    run = device.plate.run
+    device.plate.run = lambda drive: (handed.append(drive), run(drive))[1]
+    with hr.Player(driver=device) as player:
+        player.play(TONE)
+        player.sleep(0.3)
+    log = player._loop.log(0)
+    assert (player._loop.block, log["first"]) == (1, 0)
+    assert abs(log["drive"]).max() > 0.01
+    np.testing.assert_allclose(log["drive"], np.concatenate(handed)[: len(log["drive"])], rtol=2.0**-24, atol=1e-40)
 
 
 def test_a_watchdog_waits_for_two_blocks_of_the_driver():

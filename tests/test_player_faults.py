@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from contextlib import nullcontext
+from functools import partial
 
 import numpy as np
 import pytest
@@ -295,12 +296,46 @@ def test_a_device_that_does_not_start_is_left_closed():
         assert player.time >= 0.2
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, number):
+LEFT = """
+import sys
+import hapticrender as hr
+from live_devices import TONE
+from test_faults import logged
+def session():
+    player = hr.Player(driver=logged(sys.argv[1]), paced={paced})
+    {enter}
+        player.play(TONE)
+        player.record(sys.argv[2])
+        player.sleep(0.3)
+        yield player
+sys.held = session()  # longer than this module, at whose end it would be closed
+kept = next(sys.held)
+"""
+
+
+@pytest.mark.parametrize("paced", [True, False])
+@pytest.mark.parametrize("enter", ["with player:", "if player.__enter__():"])
+def test_a_program_that_ends_before_its_with_statement_leaves_zero_drive(enter, paced, tmp_path):
+    """A generator that waits in one, or an application that has entered by hand; the journal is whole."""
+    played, journal = tmp_path / "played", tmp_path / "journal.au"
+    paths = {"PYTHONPATH": os.pathsep.join((os.getcwd(), os.path.dirname(__file__)))}
+    command = [sys.executable, "-c", LEFT.format(paced=paced, enter=enter), played, journal]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, env=os.environ | paths)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    drive = np.fromfile(played).reshape(-1, 25, 2)
+    assert drive[:-2].any()
+    assert not drive[-1].any()
+    assert len(Recording.load(journal)) >= 1500
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, status):
     """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.1), duration=100.0, name="live")
     (tmp_path / "live.toml").write_text(scene.to_toml())
     command = [sys.executable, "-m", "hapticrender", "play", "live.toml", "--out", "out"]
+    number = getattr(signal, name)
     run = subprocess.Popen(
         command,
         cwd=tmp_path,
@@ -308,14 +343,15 @@ def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, number):
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONPATH": os.getcwd()},
+        preexec_fn=partial(signal.signal, number, signal.SIG_DFL),  # also where whoever runs the tests ignores it
     )
     line = run.stdout.readline()
     assert "Hz  target" in line
     run.send_signal(number)
     printed, complaint = run.communicate(timeout=120)
-    assert run.returncode == (130 if number == signal.SIGINT else 143)
+    assert run.returncode == status
     assert "page: " in printed
-    if number == signal.SIGINT:
+    if name == "SIGINT":
         assert "interrupted" in complaint
     recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
     assert len(recording) > 0.2 * recording.rate

@@ -2,6 +2,7 @@
 
 import copy
 import ctypes
+import pickle
 import sys
 import time
 from dataclasses import replace
@@ -166,6 +167,20 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     np.testing.assert_allclose(log["reference"][settled], expected[settled], rtol=0, atol=1e-14)
 
 
+@pytest.mark.parametrize("frames", [1, 64])
+def test_the_log_has_the_drive_of_the_call_before(frames, rng):
+    """Over two seconds and more, of which the log has all but nine samples."""
+    entry = RealtimeEntry(designed(False, True), frames=frames)
+    entry.play(SampledTexture(wave(False), RATE))
+    sensed = 1e-7 * rng.standard_normal((11_008, 2))
+    calls = [plain(entry, each)[0] for each in sensed.reshape(-1, frames, 2)]
+    log, played = entry.log(0), np.concatenate([np.zeros((frames, 2)), *calls])[: len(sensed)]
+    first = int(log["first"])
+    assert 0 < first <= len(sensed) - 2 * RATE + 8
+    np.testing.assert_array_equal(log["drive"], played[first:])
+    np.testing.assert_array_equal(log["sensed"], sensed[first:])
+
+
 def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_time_goes_on():
     n = round((HOLD + 0.2) * RATE)
     for texture, goes_on in ((wave(False), True), (wave(True), False)):
@@ -326,12 +341,12 @@ def test_slots_change_hands_whole():
         assert found.result(60) == (0, 0)
 
 
-def test_what_holds_addresses_is_not_copied():
-    """A copy would read and write the memory of the first."""
+def test_what_holds_addresses_or_a_device_is_not_copied():
+    """A copy would read and write the memory of the first, or play on its device."""
     bank, scenes = controller(), hr.builtin_scenes()
     texture = SampledTexture(hr.Grating(frequency=72.0, amplitude=1e-5), 5000.0)
     own = [hr.prepare(scenes[name], compiled=False).controller() for name in ("grating-72", "one-texture-hybrid")]
-    for each in (bank, RealtimeEntry(bank), texture, *own):
-        for duplicate in (copy.copy, copy.deepcopy):
+    for each in (bank, RealtimeEntry(bank), texture, hr.Player(), *own):
+        for duplicate in (copy.copy, copy.deepcopy, pickle.dumps):
             with pytest.raises(TypeError, match=rf"^{type(each).__name__}: cannot be copied or pickled"):
                 duplicate(each)

@@ -316,9 +316,11 @@ DRIVERS = [
     (lambda: rendered(driver=SimulatedDriver), "driver = SimulatedDriver: must be an instance, not the class"),
     (lambda: protocol.encode(protocol.Frame(1, 0, bytes(250))), "payload of 250 bytes: must be <= 249"),
     (lambda: RealtimeEntry(object()), "controller of type object: must have a compiled step"),
+    (lambda: RealtimeEntry(in_blocks(), frames=64), "frames = 64: must be a multiple of the controller's block of 25"),
     (lambda: entry().finger(0.0, np.nan), "must be finite"),
     (lambda: entry().set_gain(np.nan), "gain = nan"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
+    (lambda: driver(rate=1e9), r"BaseDriver: rate=1000000000.0 must be finite and > 0 Hz, and <= 1e\+07 Hz"),
     (lambda: driver(block=0), r"block=0 must be a whole number >= 1"),
     (lambda: driver(sensed_channels=-1), r"sensed_channels=-1 must be a whole number >= 0"),
     (lambda: driver(delay=3), r"delay=3 must be a whole number >= 4"),
@@ -349,6 +351,10 @@ DRIVERS = [
         "driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
     ),
     (lambda: on_users(*TO_CARRIER), "driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
+    (
+        lambda: opened("vt-plate", driver=driver(drive_channels=1)),
+        r"driver.drive_channels = 1: must be 2 \(one a coil; of a plate with 1: \[device\] coils = 1\)",
+    ),
     (lambda: opened("hybrid", driver=driver(rate=10e3)), r"driver.drive_channels = 2: must be 3"),
 ]
 DESIGNS = [
