@@ -168,6 +168,7 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
     calibration = getattr(rendering.device, "calibration", 0.0) or scene.device_profile.calibration.gain_uncertainty
     arguments = {
         "scene": scene,
+        "duration": scene.duration if "requested" in changes else 0.0,  # a live session ends when it ends
         "method": scene.method,
         "seed": scene.seed,
         "rate": driver.rate,

@@ -465,3 +465,34 @@ def test_a_texture_of_less_than_a_hundredth_of_what_can_be_felt_is_none(unit, sc
     summary = summary_of(bands, make_signals(bands, 0.0) | {"reference": 1e-9 + tone}, {"unit": unit})
     assert summary["verdict"] == found
     assert summary["reason"].startswith("the texture is zero") == (found == "not judged")
+
+
+@pytest.mark.parametrize(
+    ("left", "gain", "flag", "found"),
+    [
+        (4.0, 1.0, 0, ("passed", "")),
+        (1.6, 1.0, 0, ("not judged", "the run ended after 1.600 s of 4.000 s")),
+        (1.6, 0.8, 0, ("failed", "")),
+        (1.6, 1.0, Flag.OVERRUN, ("failed", "flags that are not allowed: overrun in 4000 samples")),
+    ],
+)
+def test_a_run_that_was_cut_off_never_passes(left, gain, flag, found):
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands, settle=0.8)
+    signals = make_signals(bands, gain * bands.envelope, duration=left)
+    signals["flags"][:] = flag
+    recorder.append(**signals)
+    summary = recorder.finish().summary()
+    assert (summary["verdict"], summary["reason"]) == found
+
+
+def test_a_live_session_is_judged_however_short(tmp_path):
+    """Of a scene of 60 s."""
+    scene = hr.Scene(texture=hr.Grating(amplitude=10 * UM, frequency=100.0), duration=60.0, settle=0.5)
+    with hr.Player(scene, paced=False) as player:
+        player.play(scene.texture)
+        player.record(tmp_path / "live.au")
+        player.sleep(2.0)
+        summary = player.end_recording().summary()
+    assert (summary["verdict"], summary["reason"]) == ("passed", "")
+    assert not any("ended after" in note for note in summary["notes"])
