@@ -30,7 +30,7 @@ from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
 from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
-from hapticrender.loop import Terminated, prepare, run
+from hapticrender.loop import Terminated, prepare
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
 from hapticrender.report.progress import progress as progress_of
@@ -65,13 +65,15 @@ class Verdict:
     value: float | None = None  # of the worst figure (relative error, 1)
     bound: float | None = None  # on it
     elapsed: float = 0.0  # s
+    warnings: tuple[str, ...] = ()  # how the device differs from its model, see ``PlateMismatch``
     summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
     @classmethod
-    def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
+    def of(cls, summary: Mapping[str, Any], elapsed: float, warnings: tuple[str, ...] = ()) -> Verdict:
         """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
         keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
-        return cls(**{key: summary[key] for key in keys}, **summary["worst"], elapsed=elapsed, summary=summary)
+        own = {key: summary[key] for key in keys} | summary["worst"]
+        return cls(**own, elapsed=elapsed, warnings=warnings, summary=summary)
 
     @property
     def passed(self) -> bool:
@@ -212,8 +214,8 @@ def _judge(
                 raise HapticError(problem)
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
             with naming_driver(driver):
-                summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
-            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
+                summary, warned = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
+            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start, warned)
         except Terminated:
             raise
         except (Exception, SystemExit) as error:  # a vendor's library may call sys.exit
@@ -230,20 +232,21 @@ def _problem(error: BaseException) -> str:
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
-    """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
+def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`.  And warnings."""
     if folder is None:
         with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(scratch):
-            return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
+            recording = outputs.run_to_end(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick)
+            return recording.summary(), recording.warnings
     outputs.refuse_to_overwrite(folder)
     with outputs.naming_full(folder):
-        recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
-        summary = recording.summary()
+        recording = outputs.run_to_end(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
+        summary, warned = recording.summary(), recording.warnings
         if not summary["passed"]:
-            return dict(outputs.write_outputs(folder, recording).summary)
+            return dict(outputs.write_outputs(folder, recording).summary), warned
     del recording  # closes its journal
     outputs.remove_outputs(folder)
-    return summary
+    return summary, warned
 
 
 def exit_status(verdicts: Sequence[Verdict], *, strict: bool = False) -> int:
@@ -303,3 +306,5 @@ def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     elif verdict.verdict != "passed":
         tag = "error" if verdict.verdict == "error" else "skipped"
         ElementTree.SubElement(element, tag, {"message": printable(verdict.reason), "type": "scene"})
+    if verdict.warnings:
+        ElementTree.SubElement(element, "system-err").text = printable("\n".join(verdict.warnings))

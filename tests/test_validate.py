@@ -6,12 +6,16 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
+from hapticrender.errors import PlateMismatch
+from hapticrender.loop import render
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
@@ -181,6 +185,34 @@ def test_junit_is_what_ci_reads(verdicts, tmp_path):
     message = bad.find("failure").get("message")
     assert re.fullmatch(r"misses its tolerance: worst figure waveform error at .* = \d+ %, bound 2 %", message)
     assert json.loads(bad.find("failure").text)["places"]["centre"]["waveform_error"] > 0.5
+
+
+HEAVY = Scene(texture=Grating(amplitude=10e-6, frequency=120.0), duration=2.0, name="heavy", simulation={"mass": 0.036})
+
+
+def test_a_mismatch_that_is_raised_as_an_error_holds_the_recording():
+    with pytest.warns(PlateMismatch, match="the device differs"):
+        expected = render(HEAVY)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(PlateMismatch, match="the device differs") as raised:
+            render(HEAVY)
+    np.testing.assert_array_equal(raised.value.recording.drive, expected.drive)
+    assert (str(raised.value),) == raised.value.recording.warnings == expected.warnings
+
+
+def test_a_mismatch_is_a_warning_in_every_report_and_stops_no_scene(tmp_path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("error")
+        [verdict] = validate([HEAVY])
+    assert verdict.verdict == "passed"
+    [text] = verdict.warnings
+    assert [(each.category, str(each.message)) for each in caught] == [(PlateMismatch, text)]
+    assert text.startswith("the device differs from its model")
+    assert junit(tmp_path, [verdict]).find("testcase").findtext("system-err") == text
+    write_json(tmp_path / "r.json", [verdict])
+    [scene] = json.loads((tmp_path / "r.json").read_text())["scenes"]
+    assert scene["warnings"] == [text]
 
 
 def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_path):
