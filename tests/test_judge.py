@@ -375,6 +375,20 @@ def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, flag, foun
     assert summary["verdict"] == found
 
 
+@pytest.mark.parametrize(
+    ("calibration", "value", "found"), [(0.09, 0.152, "not judged"), (0.11, 0.172, "failed"), (0.5, 0.562, "failed")]
+)
+def test_noise_excuses_no_uncertainty_that_is_over_the_bound_alone(rng, calibration, value, found):
+    """White noise of 1 um reads 6.2 % of a tone of 10 um; the tolerance is 10 %, that of the windows 20 %."""
+    bands = make_bands(100.0, 10 * UM)
+    signals = make_signals(bands, bands.envelope, extra=UM * rng.standard_normal((20_000, 3)))
+    header = {"sensed_noise": UM, "motion_source": "sensors", "calibration": calibration}
+    summary = summary_of(bands, signals, header, tolerance=0.1)
+    assert summary["verdict"] == found
+    assert ("not distinct from the noise" in summary["reason"]) == (found == "not judged")
+    assert summary["worst"]["value"] == pytest.approx(value, abs=0.01)
+
+
 def test_pieces_of_any_size_give_the_same_figures(rng, monkeypatch):
     noise = white(20, 400, rng)
     expected = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]

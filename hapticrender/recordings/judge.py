@@ -229,8 +229,12 @@ def _noise(recording: Recording, each: dict[str, Any]) -> float:
 
 
 def _misses(recording: Recording, each: dict[str, Any]) -> bool:
-    """Whether a figure is over its bound, and distinct from the noise of the sensors."""
-    distinct = each["value"] - _unsure(recording.header) > HARDLY * _noise(recording, each)
+    """Whether a figure is over its bound, and distinct from the noise of the sensors.
+
+    What the uncertainty of their gain adds is no noise: where that alone is over the bound, so is the figure.
+    """
+    unsure = _unsure(recording.header)
+    distinct = each["value"] - unsure > HARDLY * _noise(recording, each) or unsure > each["bound"]
     return bool(each["value"] > each["bound"] and distinct)
 
 
