@@ -178,7 +178,7 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
         "drive_limit": model.drive_limit if np.isfinite(model.drive_limit) else None,
         "sensed_noise": (model.sensed_noise * np.linalg.norm(model.place_from_sensed, axis=1)).tolist(),
         "calibration": float(calibration),
-        **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
+        **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile", "block", "delay")},
     }
     return Recorder(journal, **(arguments | changes))
 

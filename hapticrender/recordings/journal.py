@@ -104,6 +104,8 @@ class Header(Validated):
     motion_source: str = option("true", *MOTION_SOURCES)
     sensed_noise: tuple[float, ...] = checked(_noise, (0.0,))  # rms of the sensors' white noise in the motion, a place
     calibration: float = parameter(0.0, most=1e3)  # relative uncertainty of the sensors' gain; 0 where it is not known
+    block: int | None = parameter(None, least=1, most=1e6)  # samples of the driver's; None, as the next, where unknown
+    delay: int | None = parameter(None, least=1, most=1e6)  # samples from a sensed one to the drive computed from it
 
     def __post_init__(self) -> None:
         super().__post_init__()
