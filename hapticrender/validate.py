@@ -132,8 +132,8 @@ def validate(
         raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
     judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
     entries = _read(scenes)
-    count, number = sum(isinstance(scene, Scene) for _, scene in entries), itertools.count(1)
-    shown = [(f"{next(number)}/{count} {label}" if isinstance(scene, Scene) else "") for label, scene in entries]
+    count, number = sum(isinstance(scene, Scene) for _, scene, _ in entries), itertools.count(1)
+    shown = [(f"{next(number)}/{count} {label}" if isinstance(scene, Scene) else "") for label, scene, _ in entries]
     with ExitStack() as stack:
         calls: list[Callable[[Tick | None], Verdict]] = [partial(judge, *entry) for entry in entries]
         if jobs > 1:
@@ -161,16 +161,16 @@ def _end_with(watched: Connection) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _judge_in_pool(judge: Callable[..., Verdict], label: str, scene: Scene | str) -> Verdict:
+def _judge_in_pool(judge: Callable[..., Verdict], *entry: Scene | str) -> Verdict:
     """Judge in a process of a pool; a signal ends the process, where the pool would go on with the next scene."""
     try:
-        return judge(label, scene, None)
+        return judge(*entry, None)
     except (Terminated, KeyboardInterrupt):
         os._exit(128 + signal.SIGTERM)
 
 
 def _result(
-    future: Future[Verdict], entry: tuple[str, Scene | str], judge: Callable[..., Verdict], _: Tick | None
+    future: Future[Verdict], entry: tuple[str, Scene | str, str], judge: Callable[..., Verdict], _: Tick | None
 ) -> Verdict:
     """Wait for a verdict of a pool; a killed process breaks the whole pool, and not every scene can be sent to one."""
     try:
@@ -179,21 +179,24 @@ def _result(
         return judge(*entry, None, problem=_LOST if isinstance(error, BrokenProcessPool) else _problem(error))
 
 
-def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
-    """Labels and scenes, or why one cannot be read; those of one name are numbered."""
-    found: list[tuple[str, Scene | str]] = []
+def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str, str]]:
+    """Labels, scenes, or why one cannot be read, and the file of a scene; those of one name are numbered."""
+    found: list[tuple[str, Scene | str, str]] = []
     for reference in scenes:
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
-            found.append((scene.name, scene))
+            own = reference is scene or str(reference) == scene.name
+            found.append((scene.name, scene, "" if own else str(reference)))
         except Exception as error:
-            found.append((str(reference), _problem(error)))
-    return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
+            found.append((str(reference), _problem(error), ""))
+    labels = distinct_names(name for name, _, _ in found)
+    return [(label, scene, file) for label, (_, scene, file) in zip(labels, found, strict=True)]
 
 
 def _judge(
     label: str,
     scene: Scene | str,
+    file: str,
     tick: Tick | None,
     *,
     method: str | None,
@@ -219,7 +222,7 @@ def _judge(
         except Terminated:
             raise
         except (Exception, SystemExit) as error:  # a vendor's library may call sys.exit
-            problem = _problem(error)
+            problem = f"{file}: {_problem(error)}" if file else _problem(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
@@ -273,7 +276,7 @@ def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
         "passed": all(verdict.passed for verdict in verdicts),
         "scenes": [asdict(verdict) | {"passed": verdict.passed} for verdict in verdicts],
     }
-    Path(path).write_text(as_json(report), encoding="utf-8")
+    outputs.write_report(path, as_json(report).encode("utf-8"))
 
 
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
@@ -290,7 +293,7 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
     for verdict in verdicts:
         _add_case(suite, verdict)
     ElementTree.indent(suites)
-    ElementTree.ElementTree(suites).write(path, encoding="utf-8", xml_declaration=True)
+    outputs.write_report(path, ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True))
 
 
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:

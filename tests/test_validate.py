@@ -8,6 +8,7 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -60,6 +61,40 @@ def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
     (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.1).to_toml())
     with pytest.raises(ValueError, match=r"a.toml: render.settle = 2.1: must be <= 2 s, the scene's duration"):
         open_scene(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_scenes_of_one_name_are_told_apart_by_their_files(tmp_path, jobs):
+    """One that cannot be read, and one of the same name as the next that no device carries."""
+    texts = {"a": SHORT.to_toml(), "b": SHORT.to_toml().replace("47.0", "4700.0"), "c": "x = "}
+    files = [tmp_path / f"{name}.toml" for name in texts]
+    for file, text in zip(files, texts.values(), strict=True):
+        file.write_text(text)
+    found = validate(files, jobs=jobs)
+    assert [each.verdict for each in found] == ["passed", "error", "error"]
+    assert str(found[1]).startswith(f"short (2): {files[1]}: texture.frequency")
+    assert [str(each).count(str(file)) for each, file in zip(found, files, strict=True)] == [0, 1, 1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("option", ["--json", "--junit"])
+def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, option):
+    import resource
+
+    (tmp_path / "r").write_text("older")
+    command = [sys.executable, "-m", "hapticrender", "validate", *["no-such-scene"] * 50, option, str(tmp_path / "r")]
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (512, 512))
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
+    assert done.returncode == 2
+    assert f"{option} = '{tmp_path / 'r'}': File too large" in done.stderr
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("r", "older")]
+
+
+def test_a_report_goes_through_a_link(tmp_path, verdicts):
+    (tmp_path / "link").symlink_to(tmp_path / "r.json")
+    write_json(tmp_path / "link", verdicts)
+    assert (tmp_path / "link").is_symlink()
+    assert json.loads((tmp_path / "r.json").read_text())["hapticrender"]
 
 
 def test_a_scene_that_cannot_be_sent_to_another_process_stops_no_other():

@@ -15,7 +15,7 @@ from hapticrender.errors import PlateMismatch
 from hapticrender.formatting import as_json
 from hapticrender.loop import run
 from hapticrender.protocols import Rendering
-from hapticrender.recordings.formats import MissingExtra, write_sound
+from hapticrender.recordings.formats import MissingExtra, replacing, write_sound
 from hapticrender.recordings.journal import read_journal
 from hapticrender.recordings.recording import Recording
 from hapticrender.report import picture
@@ -54,6 +54,16 @@ def check_file(option: str, path: Path) -> None:
     if path.exists() and not os.access(path, os.W_OK):
         raise ValueError(f"{option} = {str(path)!r}: no permission to write it")
     check_folder(option, path.parent)
+
+
+def write_report(path: str | Path, data: bytes) -> None:
+    """Write a report, which replaces an older file when it is whole; a link, a pipe or a device is written into."""
+    path = Path(path)
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        path.write_bytes(data)
+        return
+    with replacing(path) as scratch:
+        scratch.write_bytes(data)
 
 
 def written_in(folder: Path) -> list[Path]:
