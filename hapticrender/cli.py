@@ -149,8 +149,8 @@ def _add_measurements(choices: Any) -> None:
     finger.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
     text = "profile (TOML) of the plate, as identify writes it (default: that of the scene of the recording)"
     finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
-    text = "samples of a block of the driver that recorded (default: 1)"
-    finger.add_argument("--block", metavar="N", type=_whole(1, 99999), default=1, help=text)
+    text = "samples of a block of the driver that recorded (default: as the recording says, or 1)"
+    finger.add_argument("--block", metavar="N", type=_whole(1, 99999), help=text)
     text = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
     finger.add_argument("--free-start", action="store_true", help=text)
     _add_out(finger, required=True)

@@ -77,7 +77,12 @@ class WatchdogTimeout(HapticError):
 
 
 class PlateMismatch(UserWarning):
-    """The device differs from the model that a controller is designed for; names the quantities and by how much."""
+    """The device differs from the model that a controller is designed for; names the quantities and by how much.
+
+    Raised as an error, where warnings are, it holds the `recording` of the run, if there was one.
+    """
+
+    recording: Recording | None = None
 
 
 # what a wrong scene or file may raise

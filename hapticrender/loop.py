@@ -170,6 +170,7 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
     calibration = getattr(rendering.device, "calibration", 0.0) or scene.device_profile.calibration.gain_uncertainty
     arguments = {
         "scene": scene,
+        "duration": scene.duration if "requested" in changes else 0.0,  # a live session ends when it ends
         "method": scene.method,
         "seed": scene.seed,
         "rate": driver.rate,
@@ -179,7 +180,7 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
         "drive_limit": model.drive_limit if np.isfinite(model.drive_limit) else None,
         "sensed_noise": (model.sensed_noise * np.linalg.norm(model.place_from_sensed, axis=1)).tolist(),
         "calibration": float(calibration),
-        **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile")},
+        **{name: getattr(model, name) for name in ("places", "unit", "drive_unit", "profile", "block", "delay")},
     }
     return Recorder(journal, **(arguments | changes))
 
@@ -400,25 +401,36 @@ class _Loop:
 def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
     """Warn where the device differs from the model that the controller was designed for."""
     scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
+    messages = []
     profile = f", profile {source}" if source else ""
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
         message += "the sensors' noise where there is none"
         message += f", which profile {source} lacks" if source else ""
-        warnings.warn(message, PlateMismatch, stacklevel=3)
+        messages.append(message)
     mismatch = getattr(controller, "mismatch", 0.0)
-    if mismatch <= MISMATCH:
-        return
+    if mismatch > MISMATCH:
+        messages.append(_mismatch(rendering, recording, mismatch, profile))
+    recording.warnings = tuple(messages)
+    for message in messages:
+        try:
+            warnings.warn(message, PlateMismatch, stacklevel=3)
+        except PlateMismatch as error:  # as an error it must not lose what was played
+            error.recording = recording
+            raise
+
+
+def _mismatch(rendering: Rendering, recording: Recording, mismatch: float, profile: str) -> str:
+    """State by how much the device differs from its model, at which frequencies, and what to do."""
     errors = _stiffness_errors(rendering, recording)
     found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
     cure = "correct [device]"
     if rendering.scene.device == "vt-plate":
         cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
-    message = (
+    return (
         f"the device differs from its model{profile}: the controller adds {100 * mismatch:.1f} % to what that asks for "
         f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
     )
-    warnings.warn(message, PlateMismatch, stacklevel=3)
 
 
 def _stiffness_errors(rendering: Rendering, recording: Recording) -> list[tuple[float, float]]:

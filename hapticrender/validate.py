@@ -30,7 +30,7 @@ from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
 from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
-from hapticrender.loop import Terminated, prepare, run
+from hapticrender.loop import Terminated, prepare
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
 from hapticrender.report.progress import progress as progress_of
@@ -65,13 +65,15 @@ class Verdict:
     value: float | None = None  # of the worst figure (relative error, 1)
     bound: float | None = None  # on it
     elapsed: float = 0.0  # s
+    warnings: tuple[str, ...] = ()  # how the device differs from its model, see ``PlateMismatch``
     summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
     @classmethod
-    def of(cls, summary: Mapping[str, Any], elapsed: float) -> Verdict:
+    def of(cls, summary: Mapping[str, Any], elapsed: float, warnings: tuple[str, ...] = ()) -> Verdict:
         """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
         keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
-        return cls(**{key: summary[key] for key in keys}, **summary["worst"], elapsed=elapsed, summary=summary)
+        own = {key: summary[key] for key in keys} | summary["worst"]
+        return cls(**own, elapsed=elapsed, warnings=warnings, summary=summary)
 
     @property
     def passed(self) -> bool:
@@ -130,8 +132,8 @@ def validate(
         raise ValueError(f"{jobs=}: must be 1 process where driver = {driver!r}: a device plays one scene at a time")
     judge = partial(_judge, method=method, seed=seed, driver=driver, out=None if out is None else Path(out))
     entries = _read(scenes)
-    count, number = sum(isinstance(scene, Scene) for _, scene in entries), itertools.count(1)
-    shown = [(f"{next(number)}/{count} {label}" if isinstance(scene, Scene) else "") for label, scene in entries]
+    count, number = sum(isinstance(scene, Scene) for _, scene, _ in entries), itertools.count(1)
+    shown = [(f"{next(number)}/{count} {label}" if isinstance(scene, Scene) else "") for label, scene, _ in entries]
     with ExitStack() as stack:
         calls: list[Callable[[Tick | None], Verdict]] = [partial(judge, *entry) for entry in entries]
         if jobs > 1:
@@ -159,16 +161,16 @@ def _end_with(watched: Connection) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
-def _judge_in_pool(judge: Callable[..., Verdict], label: str, scene: Scene | str) -> Verdict:
+def _judge_in_pool(judge: Callable[..., Verdict], *entry: Scene | str) -> Verdict:
     """Judge in a process of a pool; a signal ends the process, where the pool would go on with the next scene."""
     try:
-        return judge(label, scene, None)
+        return judge(*entry, None)
     except (Terminated, KeyboardInterrupt):
         os._exit(128 + signal.SIGTERM)
 
 
 def _result(
-    future: Future[Verdict], entry: tuple[str, Scene | str], judge: Callable[..., Verdict], _: Tick | None
+    future: Future[Verdict], entry: tuple[str, Scene | str, str], judge: Callable[..., Verdict], _: Tick | None
 ) -> Verdict:
     """Wait for a verdict of a pool; a killed process breaks the whole pool, and not every scene can be sent to one."""
     try:
@@ -177,21 +179,24 @@ def _result(
         return judge(*entry, None, problem=_LOST if isinstance(error, BrokenProcessPool) else _problem(error))
 
 
-def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str]]:
-    """Labels and scenes, or why one cannot be read; those of one name are numbered."""
-    found: list[tuple[str, Scene | str]] = []
+def _read(scenes: Iterable[Scene | str | Path]) -> list[tuple[str, Scene | str, str]]:
+    """Labels, scenes, or why one cannot be read, and the file of a scene; those of one name are numbered."""
+    found: list[tuple[str, Scene | str, str]] = []
     for reference in scenes:
         try:
             scene = reference if isinstance(reference, Scene) else open_scene(reference)
-            found.append((scene.name, scene))
+            own = reference is scene or str(reference) == scene.name
+            found.append((scene.name, scene, "" if own else str(reference)))
         except Exception as error:
-            found.append((str(reference), _problem(error)))
-    return list(zip(distinct_names(name for name, _ in found), (scene for _, scene in found), strict=True))
+            found.append((str(reference), _problem(error), ""))
+    labels = distinct_names(name for name, _, _ in found)
+    return [(label, scene, file) for label, (_, scene, file) in zip(labels, found, strict=True)]
 
 
 def _judge(
     label: str,
     scene: Scene | str,
+    file: str,
     tick: Tick | None,
     *,
     method: str | None,
@@ -212,12 +217,12 @@ def _judge(
                 raise HapticError(problem)
             rendering = prepare(scene, driver=driver, method=method, seed=seed)
             with naming_driver(driver):
-                summary = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
-            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start)
+                summary, warned = _summary(rendering, out and out / _NO_NAME.sub("_", label), tick)
+            return Verdict.of({**summary, "scene": label}, time.perf_counter() - start, warned)
         except Terminated:
             raise
         except (Exception, SystemExit) as error:  # a vendor's library may call sys.exit
-            problem = _problem(error)
+            problem = f"{file}: {_problem(error)}" if file else _problem(error)
     reason, method = problem.removeprefix(f"{label}: "), method or defaults.METHOD
     return Verdict(scene=label, device=device, method=method, seed=seed or 0, verdict="error", reason=reason)
 
@@ -230,20 +235,21 @@ def _problem(error: BaseException) -> str:
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> dict[str, Any]:
-    """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`."""
+def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`.  And warnings."""
     if folder is None:
         with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(scratch):
-            return run(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick).summary()
+            recording = outputs.run_to_end(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick)
+            return recording.summary(), recording.warnings
     outputs.refuse_to_overwrite(folder)
     with outputs.naming_full(folder):
-        recording = run(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
-        summary = recording.summary()
+        recording = outputs.run_to_end(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
+        summary, warned = recording.summary(), recording.warnings
         if not summary["passed"]:
-            return dict(outputs.write_outputs(folder, recording).summary)
+            return dict(outputs.write_outputs(folder, recording).summary), warned
     del recording  # closes its journal
     outputs.remove_outputs(folder)
-    return summary
+    return summary, warned
 
 
 def exit_status(verdicts: Sequence[Verdict], *, strict: bool = False) -> int:
@@ -270,7 +276,7 @@ def write_json(path: str | Path, verdicts: Sequence[Verdict]) -> None:
         "passed": all(verdict.passed for verdict in verdicts),
         "scenes": [asdict(verdict) | {"passed": verdict.passed} for verdict in verdicts],
     }
-    Path(path).write_text(as_json(report), encoding="utf-8")
+    outputs.write_report(path, as_json(report).encode("utf-8"))
 
 
 def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
@@ -287,7 +293,7 @@ def write_junit(path: str | Path, verdicts: Sequence[Verdict]) -> None:
     for verdict in verdicts:
         _add_case(suite, verdict)
     ElementTree.indent(suites)
-    ElementTree.ElementTree(suites).write(path, encoding="utf-8", xml_declaration=True)
+    outputs.write_report(path, ElementTree.tostring(suites, encoding="utf-8", xml_declaration=True))
 
 
 def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
@@ -303,3 +309,5 @@ def _add_case(suite: ElementTree.Element, verdict: Verdict) -> None:
     elif verdict.verdict != "passed":
         tag = "error" if verdict.verdict == "error" else "skipped"
         ElementTree.SubElement(element, tag, {"message": printable(verdict.reason), "type": "scene"})
+    if verdict.warnings:
+        ElementTree.SubElement(element, "system-err").text = printable("\n".join(verdict.warnings))

@@ -363,9 +363,11 @@ def _recording(path: Path) -> Recording:
     """Load a recording, also from the folder of a rendered scene."""
     from hapticrender.recordings.recording import Recording
 
+    inside = sorted(str(each.parent) for each in path.glob("*/recording.au"))
     path = path / "recording.au" if path.is_dir() else path
+    where = f"; there is one in {', '.join(inside)}" if inside else ""
     if not path.exists():
-        raise ValueError(f"{path}: no such file")
+        raise ValueError(f"{path}: no such file{where}")
     with naming(path):
         return Recording.load(path)
 

@@ -11,6 +11,7 @@ from test_analysis_plate import open_loop
 import hapticrender as hr
 from hapticrender.analysis.records import DOUBTFUL, LOADED
 from hapticrender.analysis.smoothing import spread_of
+from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT
 
@@ -194,6 +195,29 @@ def test_ideal_sensors_are_no_exception(bits):
     at = judged(found)
     assert len(found.of_kind(LOADED)) == 1
     assert np.abs(found.normal_load.value[at] / glass_force(subject, recording, len(found.time))[at] - 1).max() < 0.005
+
+
+def test_a_recording_says_in_what_blocks_and_how_late_its_driver_played(tmp_path):
+    """Blocks of 4 samples, a delay of 12: late by 8 rows, of 15 degrees each at 210 Hz; an older file does not say."""
+    finger = hr.Finger.still(normal_load=0.5, mechanics="heavy", touches=[(1.0, 2.2)])
+    tones = hr.Sum([(hr.Grating(frequency=f, amplitude=6e-6), 1.0) for f in (47.0, 111.0, 210.0)])
+    scene = hr.Scene(texture=tones, finger=finger, duration=3.0)
+    plant = Plate(PlateParameters(delay=12), finger, block=4)
+    recording = hr.render(scene, driver=SimulatedDriver(plant))
+    assert (recording.header.block, recording.header.delay) == (4, 12)
+    recording.save(tmp_path / "run.h5")
+    profile = hr.DeviceProfile(kind="vt-plate", device={"delay": 12})
+    found = hr.analyse_finger(hr.Recording.load(tmp_path / "run.h5"))
+    np.testing.assert_array_equal(
+        found.normal_load.value, hr.analyse_finger(recording, profile, block=4).normal_load.value
+    )
+    assert len(found.of_kind(LOADED)) == 1
+    assert not any("delay" in note for note in found.notes)
+    other = hr.analyse_finger(recording, PlateParameters(delay=11))
+    assert "the profile's delay, 11 samples, is not that of the recording, 12 samples" in other.notes
+    older = hr.Recording(replace(recording.header, block=None, delay=None), recording.frames)
+    with pytest.raises(ValueError, match=r"plate's delay, 1: state delay, .* in \[device\] of the profile"):
+        hr.analyse_finger(older, block=4)
 
 
 def test_what_was_lost_or_is_not_one_finger_is_not_taken_for_one(studied):

@@ -76,7 +76,10 @@ def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
     assert cli.main(["finger", str(path), "--block", "2", "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert str(path) in error
-    assert "block=2 samples: must be an integer from 1 to the plate's delay, 1" in error
+    assert (
+        "block=2 samples: must be an integer from 1 to the plate's delay, 1: state delay, from a sensed sample to"
+        in error
+    )
     assert not (tmp_path / "out").exists()
 
 

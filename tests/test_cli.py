@@ -409,3 +409,11 @@ def test_no_scene_file_ever_makes_a_traceback(run, tmp_path_factory, text):
     else:
         assert complaint(result).startswith(f"hapticrender: {path}: ")
         assert not (folder / "out").exists()
+
+
+def test_show_names_the_folders_that_hold_a_recording(run, tmp_path):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "recording.au").touch()
+    folders = ", ".join(str(tmp_path / name) for name in ("one", "two"))
+    assert complaint(run("show", tmp_path)).endswith(f"recording.au: no such file; there is one in {folders}")

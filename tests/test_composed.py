@@ -189,6 +189,13 @@ def test_methods_that_play_bands_refuse_a_whole_waveform(device, method):
         hr.prepare(scene).controller()
 
 
+def test_a_hybrid_says_what_it_plays_instead_of_a_chirp():
+    chirp = hr.Chirp(start=30.0, stop=300.0, duration=1.0, amplitude=5e-6)
+    scene = hr.Scene(texture=chirp, finger=hr.Finger.sliding(speed=0.1), device="hybrid", duration=0.1)
+    with pytest.raises(ValueError, match="hybrid plays bands, .*: gratings, and recordings over position with carr"):
+        hr.prepare(scene)
+
+
 def test_a_chirp_beyond_the_judged_band_is_played_up_to_what_the_rate_carries():
     """Its drive counts as needed, so that nothing stops it; above 0.45 of the rate there is an image, not a chirp."""
     chirp = hr.Chirp(start=1000.0, stop=1900.0, duration=0.5, amplitude=5e-6)

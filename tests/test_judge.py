@@ -375,6 +375,20 @@ def test_what_the_noise_of_the_sensors_hides_is_not_judged(rng, gain, flag, foun
     assert summary["verdict"] == found
 
 
+@pytest.mark.parametrize(
+    ("calibration", "value", "found"), [(0.09, 0.152, "not judged"), (0.11, 0.172, "failed"), (0.5, 0.562, "failed")]
+)
+def test_noise_excuses_no_uncertainty_that_is_over_the_bound_alone(rng, calibration, value, found):
+    """White noise of 1 um reads 6.2 % of a tone of 10 um; the tolerance is 10 %, that of the windows 20 %."""
+    bands = make_bands(100.0, 10 * UM)
+    signals = make_signals(bands, bands.envelope, extra=UM * rng.standard_normal((20_000, 3)))
+    header = {"sensed_noise": UM, "motion_source": "sensors", "calibration": calibration}
+    summary = summary_of(bands, signals, header, tolerance=0.1)
+    assert summary["verdict"] == found
+    assert ("not distinct from the noise" in summary["reason"]) == (found == "not judged")
+    assert summary["worst"]["value"] == pytest.approx(value, abs=0.01)
+
+
 def test_pieces_of_any_size_give_the_same_figures(rng, monkeypatch):
     noise = white(20, 400, rng)
     expected = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]
@@ -465,3 +479,34 @@ def test_a_texture_of_less_than_a_hundredth_of_what_can_be_felt_is_none(unit, sc
     summary = summary_of(bands, make_signals(bands, 0.0) | {"reference": 1e-9 + tone}, {"unit": unit})
     assert summary["verdict"] == found
     assert summary["reason"].startswith("the texture is zero") == (found == "not judged")
+
+
+@pytest.mark.parametrize(
+    ("left", "gain", "flag", "found"),
+    [
+        (4.0, 1.0, 0, ("passed", "")),
+        (1.6, 1.0, 0, ("not judged", "the run ended after 1.600 s of 4.000 s")),
+        (1.6, 0.8, 0, ("failed", "")),
+        (1.6, 1.0, Flag.OVERRUN, ("failed", "flags that are not allowed: overrun in 4000 samples")),
+    ],
+)
+def test_a_run_that_was_cut_off_never_passes(left, gain, flag, found):
+    bands = make_bands(100.0, 10 * UM)
+    recorder = make_recorder(None, bands, settle=0.8)
+    signals = make_signals(bands, gain * bands.envelope, duration=left)
+    signals["flags"][:] = flag
+    recorder.append(**signals)
+    summary = recorder.finish().summary()
+    assert (summary["verdict"], summary["reason"]) == found
+
+
+def test_a_live_session_is_judged_however_short(tmp_path):
+    """Of a scene of 60 s."""
+    scene = hr.Scene(texture=hr.Grating(amplitude=10 * UM, frequency=100.0), duration=60.0, settle=0.5)
+    with hr.Player(scene, paced=False) as player:
+        player.play(scene.texture)
+        player.record(tmp_path / "live.au")
+        player.sleep(2.0)
+        summary = player.end_recording().summary()
+    assert (summary["verdict"], summary["reason"]) == ("passed", "")
+    assert not any("ended after" in note for note in summary["notes"])

@@ -118,6 +118,20 @@ def test_a_driver_may_use_its_arrays_again(name):
     np.testing.assert_array_equal(found[0].motion, found[1].motion)
 
 
+def test_the_sensors_of_a_plate_of_one_coil_show_how_it_rocks():
+    """A finger 30 mm off the middle tilts it, which the coil cannot prevent, and each sensor sits at an end."""
+    finger = hr.Finger.still(position=0.03, normal_load=0.4, mechanics="heavy")
+    tone = hr.Grating(frequency=120.0, amplitude=10e-6)
+    scene = hr.Scene(texture=tone, duration=1.5, settle=0.5, finger=finger, profile={"coils": 1})
+    true, sensed = hr.render(scene), hr.render(scene, driver=Reusing(hr.prepare(scene).plant, False))
+    np.testing.assert_array_equal(true.drive, sensed.drive)
+    np.testing.assert_allclose(sensed.motion[:, 1:], sensed.sensed, rtol=0, atol=1e-12)
+    noise = 1e-6 + 2e-3 / 2**14  # m rms of a sensor and its step, of six of which none of 7500 is beyond
+    np.testing.assert_allclose(sensed.motion, true.motion, rtol=0, atol=6 * noise)
+    figures = [each.summary() for each in (true, sensed)]
+    assert [(each["verdict"], each["worst"]["place"]) for each in figures] == [("failed", "end 2")] * 2
+
+
 def test_blocks_of_any_size_give_the_same_samples_for_the_same_delay():
     """With a delay of 6 samples, blocks of 1, 2, 3 and 6 leave 5, 4, 3 and 0 of them inside the device."""
     expected = hr.render(SPATIAL, driver=simulated(SPATIAL, delay=6))

@@ -47,6 +47,24 @@ def test_a_spatial_recording_is_read_at_the_position_at_any_speed(write, speed):
     assert bands.instantaneous_frequency(np.array([speed]))[0] == pytest.approx([speed / 0.5e-3], rel=1e-3)
 
 
+@pytest.mark.parametrize("frequency", [30.0, 47.0, 100.0, 250.0])
+@pytest.mark.parametrize("phase", [0.0, np.pi / 4, np.pi / 2], ids=["sine", "between", "cosine"])
+@pytest.mark.parametrize("rate", [1000.0, 8000.0])
+def test_a_tone_has_the_amplitude_that_is_asked_for_wherever_its_recording_begins(frequency, phase, rate):
+    """At 1 kHz none of the samples of 250 Hz, 45 degrees off, is beyond 0.71 of the peak; a constant is no part."""
+    samples = np.sin(2 * np.pi * frequency * np.arange(round(2 * rate)) / rate + phase) + 0.3
+    texture = Recorded(samples=samples, rate=rate, amplitude=5e-6)
+    played = texture.waveform(np.arange(0.5, 1.5, 1e-5), np.full(100_000, np.nan))
+    assert abs(played).max() == pytest.approx(5e-6, rel=0.01)
+
+
+def test_a_knock_at_the_start_of_a_recording_is_its_peak(rng):
+    samples = 0.01 * rng.standard_normal(8000)
+    samples[80:120] += np.sin(2 * np.pi * 200 * np.arange(40) / 8000)
+    texture = Recorded(samples=samples, rate=8000.0, amplitude=5e-6)
+    assert abs(texture.curve.values).max() <= 5e-6 * (1 + 1e-9)
+
+
 def test_beyond_its_ends_a_recording_runs_back_without_a_jump(write, rng):
     texture = Recorded(file=write(rng.uniform(-1, 1, 4001)), amplitude=10e-6)
     length = texture.curve.length

@@ -290,7 +290,14 @@ class Probed(Watched):
             {"spoil": lambda sample, sensed: sensed._replace(sensed=np.array([[3e-6, sensed.sensed[0, 1]]]))},
             "sensor 1 (is dead|repeats its values)",
         ),
-        ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))}, "100% of the samples"),
+        (
+            {"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), np.nan))},
+            "100% of the samples are invalid: check",
+        ),
+        (
+            {"sensors": 1e6 * np.eye(2), "noise": 1.0},
+            r"100% of the samples are invalid, up to [\d.e+]+ and not within \+-0.001 m: must be in m: check",
+        ),
         ({"noise": 20e-6}, "the sensors' noise is (19|2.) um rms, more than .* um: the probe cannot judge"),
         ({"noise": 4e-6, "sensors": INVERT}, "sensor 1 is inverted"),
         ({"noise": 2e-6, "coils": np.zeros((2, 2))}, "nothing moves"),

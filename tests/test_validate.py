@@ -6,12 +6,17 @@ import re
 import signal
 import subprocess
 import sys
+import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
+import numpy as np
 import pytest
 
+from hapticrender.errors import PlateMismatch
+from hapticrender.loop import render
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
@@ -56,6 +61,40 @@ def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
     (tmp_path / "a.toml").write_text(replace(SHORT, duration=2.0, settle=2.1).to_toml())
     with pytest.raises(ValueError, match=r"a.toml: render.settle = 2.1: must be <= 2 s, the scene's duration"):
         open_scene(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_scenes_of_one_name_are_told_apart_by_their_files(tmp_path, jobs):
+    """One that cannot be read, and one of the same name as the next that no device carries."""
+    texts = {"a": SHORT.to_toml(), "b": SHORT.to_toml().replace("47.0", "4700.0"), "c": "x = "}
+    files = [tmp_path / f"{name}.toml" for name in texts]
+    for file, text in zip(files, texts.values(), strict=True):
+        file.write_text(text)
+    found = validate(files, jobs=jobs)
+    assert [each.verdict for each in found] == ["passed", "error", "error"]
+    assert str(found[1]).startswith(f"short (2): {files[1]}: texture.frequency")
+    assert [str(each).count(str(file)) for each, file in zip(found, files, strict=True)] == [0, 1, 1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("option", ["--json", "--junit"])
+def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, option):
+    import resource
+
+    (tmp_path / "r").write_text("older")
+    command = [sys.executable, "-m", "hapticrender", "validate", *["no-such-scene"] * 50, option, str(tmp_path / "r")]
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (512, 512))
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
+    assert done.returncode == 2
+    assert f"{option} = '{tmp_path / 'r'}': File too large" in done.stderr
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("r", "older")]
+
+
+def test_a_report_goes_through_a_link(tmp_path, verdicts):
+    (tmp_path / "link").symlink_to(tmp_path / "r.json")
+    write_json(tmp_path / "link", verdicts)
+    assert (tmp_path / "link").is_symlink()
+    assert json.loads((tmp_path / "r.json").read_text())["hapticrender"]
 
 
 def test_a_scene_that_cannot_be_sent_to_another_process_stops_no_other():
@@ -181,6 +220,34 @@ def test_junit_is_what_ci_reads(verdicts, tmp_path):
     message = bad.find("failure").get("message")
     assert re.fullmatch(r"misses its tolerance: worst figure waveform error at .* = \d+ %, bound 2 %", message)
     assert json.loads(bad.find("failure").text)["places"]["centre"]["waveform_error"] > 0.5
+
+
+HEAVY = Scene(texture=Grating(amplitude=10e-6, frequency=120.0), duration=2.0, name="heavy", simulation={"mass": 0.036})
+
+
+def test_a_mismatch_that_is_raised_as_an_error_holds_the_recording():
+    with pytest.warns(PlateMismatch, match="the device differs"):
+        expected = render(HEAVY)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(PlateMismatch, match="the device differs") as raised:
+            render(HEAVY)
+    np.testing.assert_array_equal(raised.value.recording.drive, expected.drive)
+    assert (str(raised.value),) == raised.value.recording.warnings == expected.warnings
+
+
+def test_a_mismatch_is_a_warning_in_every_report_and_stops_no_scene(tmp_path):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("error")
+        [verdict] = validate([HEAVY])
+    assert verdict.verdict == "passed"
+    [text] = verdict.warnings
+    assert [(each.category, str(each.message)) for each in caught] == [(PlateMismatch, text)]
+    assert text.startswith("the device differs from its model")
+    assert junit(tmp_path, [verdict]).find("testcase").findtext("system-err") == text
+    write_json(tmp_path / "r.json", [verdict])
+    [scene] = json.loads((tmp_path / "r.json").read_text())["scenes"]
+    assert scene["warnings"] == [text]
 
 
 def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_path):

@@ -17,6 +17,7 @@ import numpy as np
 from hapticrender.accuracy import friction, plate
 from hapticrender.errors import DesignError
 from hapticrender.formatting import as_json
+from hapticrender.report.outputs import write_report
 
 SCALE = {"%": 100.0, "ms": 1e3, "um": 1e6, "samples": 1.0}  # of a figure in SI
 
@@ -162,4 +163,4 @@ def write_json(path: Path, figures: Iterable[Figure]) -> None:
         | {"passed": each.passed, "reached": each.reached}
         for each in figures
     ]
-    path.write_text(as_json({"suite": "accuracy", "figures": rows}), encoding="utf-8")
+    write_report(path, as_json({"suite": "accuracy", "figures": rows}).encode("utf-8"))

@@ -43,7 +43,7 @@ def analyse_finger(
     recording: Recording,
     profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None = None,
     *,
-    block: int = 1,
+    block: int | None = None,
     free_start: bool = False,
 ) -> FingerRecord:
     """Estimate load, position, velocity, contact, force and impedance of the finger in a recording of a plate.
@@ -56,9 +56,10 @@ def analyse_finger(
         Of a plate with two sensors at the ends of its glass, at least 1 s and 500 Hz.
     profile : DeviceProfile, PlateParameters or path of a profile, optional
         Model of the plate, with its uncertainty; default: that of the recording's scene.  Parameters without one have
-        2 %, damping 10 %.
-    block : int, samples
-        Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it.
+        2 %, damping 10 %.  The delay is that of the recording, if known, where a profile states none.
+    block : int, samples, optional
+        Of the driver: a row of the drive acts ``delay - block`` samples after the row sensed with it; default: that of
+        the recording, 1 where unknown.
     free_start : bool
         Whether nothing touches in the first 0.5 s, from which the sensors' zero is then taken; default: they read zero
         where nothing touches.
@@ -78,6 +79,7 @@ def analyse_finger(
     """
     require(isinstance(recording, Recording), "recording", recording, "a Recording: see Recording.load", TypeError)
     course = _course(recording, profile)
+    block = recording.header.block or 1 if block is None else block
     late = course.plate.delay - block
     _check(recording, course.plate, late)
     rate = recording.rate
@@ -124,7 +126,7 @@ def _spoiled(recording: Recording) -> Array:
 
 def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
     """Return the plate's parameters before the recording is looked at."""
-    duration = len(recording) / recording.rate
+    duration, given = len(recording) / recording.rate, profile is not None
     if isinstance(profile, PlateParameters):
         return Course.of(profile, duration=duration)
     if isinstance(profile, str | os.PathLike):
@@ -135,7 +137,9 @@ def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str
     require(isinstance(profile, DeviceProfile), "profile", profile, accepted, TypeError)
     if profile.kind != "vt-plate":
         raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
-    return Course.of(PlateParameters.with_overrides(profile.device), profile.uncertainty, duration)
+    known = {} if recording.header.delay is None else {"delay": recording.header.delay}
+    stated = {**known, **profile.device} if given else {**profile.device, **known}
+    return Course.of(PlateParameters.with_overrides(stated), profile.uncertainty, duration)
 
 
 def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
@@ -149,8 +153,11 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
     block = plate.delay - late
+    cure = "delay, from a sensed sample to the drive computed from it, in [device] of the profile"
     if not (isinstance(block, int | np.integer) and 1 <= block <= plate.delay):
-        raise ValueError(f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}")
+        raise ValueError(
+            f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}: state {cure}"
+        )
     if not np.isfinite(recording.sensed).any(axis=0).all():
         raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
 
@@ -280,6 +287,8 @@ def _notes(
             yield f"{text}: errors near there are larger than stated"
     if implausible := _implausible(touch, impedance, len(recording) / recording.rate):
         yield f"{implausible}: check units, signs and scales of drive and sensors, the block, and the profile"
-    plate = course.plate
-    if abs(recording.rate - plate.rate) > 1e-3 * plate.rate:
+    plate, known = course.plate, recording.header.delay
+    if known is not None and plate.delay != known:
+        yield f"the profile's delay, {plate.delay} samples, is not that of the recording, {known} samples"
+    if known != plate.delay and abs(recording.rate - plate.rate) > 1e-3 * plate.rate:
         yield f"the profile's delay, {plate.delay} samples, is taken at {recording.rate:g} Hz, not at {plate.rate:g} Hz"

@@ -173,7 +173,7 @@ def design_combined(
     method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
 ) -> CombinedController:
     """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
-    refuse_whole_waveform(bands)
+    refuse_whole_waveform(bands, "a hybrid", "recordings over position")
     models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
     parts: list[Any] = []
     for each, own in zip(models, shares, strict=True):

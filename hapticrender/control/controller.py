@@ -177,10 +177,11 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     return float(fixed.min(initial=math.inf if len(fixed) == len(bands) else model.lowest_frequency))
 
 
-def refuse_whole_waveform(bands: Bands) -> None:
+def refuse_whole_waveform(bands: Bands, who: str = "this method", recordings: str = "recordings") -> None:
     """Refuse a texture without carriers, in a method that works band by band."""
     if bands.envelope is None and not len(bands):
-        raise ValueError("texture.carriers is missing: must be >= 1, this method plays bands, not the whole waveform")
+        played = f"{who} plays bands, not the whole waveform: gratings, and {recordings} with carriers"
+        raise ValueError(f"texture.carriers is missing: must be >= 1, {played}")
 
 
 def shared_settings(

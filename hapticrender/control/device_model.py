@@ -90,6 +90,7 @@ class DeviceModel:
     rms_limit: float = math.inf  # drive unit, > 0: largest rms of each drive channel ...
     rms_time: float = 10.0  # s: ... over about this time constant, by which a coil heats
     sensed_bound: float = math.inf  # sensor unit, > 0: a larger magnitude stops the drive
+    shown: Array | None = None  # (p, s): `place_from_sensed`, where sensors show more than the coordinates
 
     @property
     def pattern(self) -> tuple[float, ...]:
@@ -104,7 +105,7 @@ class DeviceModel:
     @property
     def place_from_sensed(self) -> Array:
         """Displacement at each evaluation point per sensed signal, shape (p, s)."""
-        return self.place_from_coordinate @ self.coordinate_from_sensed
+        return self.shown if self.shown is not None else self.place_from_coordinate @ self.coordinate_from_sensed
 
     def dynamic_stiffness(self, frequency: Array) -> Array:
         """D(j w), N/m, complex, shape (..., c, c), at `frequency` (Hz, shape (...))."""

@@ -54,9 +54,9 @@ class Found(NamedTuple):
     """Result of a probe."""
 
     fault: str  # what is not as stated; "" where nothing was found
-    residual: float  # of the wiring as stated
+    residual: float  # of the wiring as stated; NaN, as the next, where it was not looked for
     scale: float  # of the response over that of the model, 1 where all is as stated
-    delay: int  # samples, of the loop
+    delay: int  # samples, of the loop; -1 where it was not looked for
 
 
 def probe_plate(driver: Driver, model: DeviceModel) -> None:
@@ -73,10 +73,13 @@ def probe_plate(driver: Driver, model: DeviceModel) -> None:
         if not found[-1].fault:
             return
     last = found[-1]
+    shares = ((name, getattr(last, name)) for name in ("residual", "scale"))
+    figures = [f"{name} {value:.2g}" for name, value in shares if np.isfinite(value)]
+    figures += [f"delay {last.delay} samples"] * (last.delay >= 0)
+    measured = f" ({', '.join(figures)})" if figures else ""
     raise DeviceFault(
-        f"{type(driver).__name__}: refused by the start-up probe: {last.fault} (residual {last.residual:.2g}, scale "
-        f"{last.scale:.2g}, delay {last.delay} samples): check the wiring, or [device]; [render] probe = false leaves "
-        "the probe out"
+        f"{type(driver).__name__}: refused by the start-up probe: {last.fault}{measured}: check the wiring, or "
+        "[device]; [render] probe = false leaves the probe out"
     )
 
 
@@ -111,7 +114,10 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
-        return Found(f"{(~valid).mean():.0%} of the samples are invalid", np.nan, np.nan, -1)
+        largest, bound = abs(sensed[np.isfinite(sensed)]).max(initial=0.0), f"+-{model.sensed_limit:g} {model.unit}"
+        beyond = f", up to {largest:.3g} and not within {bound}: must be in {model.unit}"
+        invalid = f"{(~valid).mean():.0%} of the samples are invalid"
+        return Found(invalid + beyond * bool(largest > model.sensed_limit), np.nan, np.nan, -1)
     y = _detrended(np.where(valid[:, None], sensed, 0.0))
     energy, model_energy = float((y**2).sum()), float((expected["nothing", stated] ** 2).sum())
     noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise

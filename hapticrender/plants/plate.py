@@ -158,6 +158,7 @@ class PlateParameters(Validated):
         """Device model of this plate without a finger, in a loop of `rate` (Hz) and `delay` (samples)."""
         n = self.coils  # one coil moves one coordinate
         places = self.displacement([0.0, *self.ends])[:, :2]
+        sensors = np.linalg.inv(places[1:]) / (self.sensor_gain_1, self.sensor_gain_2)  # heave and rocking per sensor
         return DeviceModel(
             rate=rate,
             delay=delay,
@@ -165,7 +166,7 @@ class PlateParameters(Validated):
             damping=self.damping_matrix[:n, :n],
             stiffness=self.stiffness_matrix[:n, :n],
             force_from_drive=self.force_from_drive[:n],
-            coordinate_from_sensed=np.linalg.inv(places[1:])[:n] / (self.sensor_gain_1, self.sensor_gain_2),
+            coordinate_from_sensed=sensors[:n],
             side_from_coordinate=SIDES[:n, :n],
             place_from_coordinate=places[:, :n],
             places=PLACES,
@@ -176,6 +177,7 @@ class PlateParameters(Validated):
             bending=self.bending,
             rigid=self.bending is None,
             lever_per_metre=(n - 1) / self.half_spacing,
+            shown=places @ sensors if n < len(sensors) else None,  # one coil does not move the rocking
         )
 
 

@@ -90,7 +90,7 @@ class Header(Validated):
     method: str = checked(text)
     seed: int = parameter(most=2**63 - 1)
     rate: float = parameter(unit="Hz", least=1e-3, most=1e9)  # exact; the AU header holds it rounded
-    duration: float = parameter(unit="s", most=1e9)  # of the scene; a killed run is shorter
+    duration: float = parameter(unit="s", most=1e9)  # of the scene, 0 of a live session; a killed run is shorter
     tolerance: float = parameter(most=1e3)  # largest relative waveform error of the scene
     settle: float = parameter(unit="s", most=1e9)  # before the scene is judged
     bands: Bands = checked(_bands)
@@ -104,6 +104,8 @@ class Header(Validated):
     motion_source: str = option("true", *MOTION_SOURCES)
     sensed_noise: tuple[float, ...] = checked(_noise, (0.0,))  # rms of the sensors' white noise in the motion, a place
     calibration: float = parameter(0.0, most=1e3)  # relative uncertainty of the sensors' gain; 0 where it is not known
+    block: int | None = parameter(None, least=1, most=1e6)  # samples of the driver's; None, as the next, where unknown
+    delay: int | None = parameter(None, least=1, most=1e6)  # samples from a sensed one to the drive computed from it
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -114,9 +116,9 @@ class Header(Validated):
 
     @classmethod
     def of(cls, scene: Scene, **rest: Any) -> Header:
-        """Take name, device, duration, tolerance and settling time from a scene."""
+        """Take name, device, duration, tolerance and settling time from a scene, but for what `rest` states."""
         own = {name: getattr(scene, name) for name in ("name", "device", "duration", "tolerance", "settle")}
-        return cls(scene=scene.to_toml(), **own, **rest)
+        return cls(scene=scene.to_toml(), **own | rest)
 
     @cached_property
     def columns(self) -> dict[str, list[tuple[str, str]]]:

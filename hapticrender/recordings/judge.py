@@ -32,13 +32,14 @@ def summary(recording: Recording) -> dict[str, Any]:
 
     The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
     scene specifies it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
-    rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of
-    100 ms, and the worst `third_octave_error` (on a plate up to 1000 Hz) are within twice the tolerance, and no sample
-    is flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside
-    20 to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said and no
-    sample is flagged.  `worst` is the figure furthest over its `bound`; `reason` states what else decided.  See
-    ``waveform_figures`` for the equations.  `contacts` are the errors after touches and lifts; `delay` (s), `gain` and
-    `incoherent` share state how y differs from r and decide nothing, like all that follows.
+    rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of 100
+    ms, and the worst `third_octave_error` (on a plate up to 1000 Hz) are within twice the tolerance, and no sample is
+    flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20
+    to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said, or the
+    run was cut off before a figure failed, and no sample is flagged.  `worst` is the figure furthest over its `bound`;
+    `reason` states what else decided.  See ``waveform_figures`` for the equations.  `contacts` are the errors after
+    touches and lifts; `delay` (s), `gain` and `incoherent` share state how y differs from r and decide nothing, like
+    all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
     mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
@@ -158,7 +159,7 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
     if raised:
         return "failed", f"flags that are not allowed: {', '.join(raised).lower()}"
-    if unjudged:
+    if unjudged or (unjudged := _cut(recording)):
         return "not judged", unjudged
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
@@ -183,6 +184,12 @@ def _unjudged(recording: Recording, worst: dict[str, Any]) -> str:
         noise = percent(_noise(recording, worst))
         return f"the worst figure is not distinct from the noise of the sensors, {noise}"
     return ""
+
+
+def _cut(recording: Recording) -> str:
+    """State after what part of its planned length the run ended; nothing where it is whole, or has none."""
+    seconds, planned = len(recording) / recording.rate, recording.header.duration
+    return f"the run ended after {seconds:.3f} s of {planned:.3f} s" if seconds < planned - 0.5 / recording.rate else ""
 
 
 def _stopped(recording: Recording) -> str:
@@ -222,8 +229,12 @@ def _noise(recording: Recording, each: dict[str, Any]) -> float:
 
 
 def _misses(recording: Recording, each: dict[str, Any]) -> bool:
-    """Whether a figure is over its bound, and distinct from the noise of the sensors."""
-    distinct = each["value"] - _unsure(recording.header) > HARDLY * _noise(recording, each)
+    """Whether a figure is over its bound, and distinct from the noise of the sensors.
+
+    What the uncertainty of their gain adds is no noise: where that alone is over the bound, so is the figure.
+    """
+    unsure = _unsure(recording.header)
+    distinct = each["value"] - unsure > HARDLY * _noise(recording, each) or unsure > each["bound"]
     return bool(each["value"] > each["bound"] and distinct)
 
 
@@ -243,8 +254,8 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
             "the motion is judged against the texture at the recorded position, which the touch panel estimates: its "
             "error against the finger's true position is in none of the figures; hr.phase_error predicts it"
         )
-    if seconds < header.duration - 0.5 / recording.rate:
-        notes.append(f"the run ended after {seconds:.3f} s of {header.duration:.3f} s")
+    if cut := _cut(recording):
+        notes.append(cut)
     if seconds < 2 * header.settle:
         notes.append("the run is shorter than twice the settling time: its second half is judged")
     if (recording.waveform["share_outside"] or 0.0) > UNPLAYABLE:

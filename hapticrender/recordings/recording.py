@@ -213,6 +213,7 @@ class Recording:
     def __init__(self, header: Header, frames: Array | journal.JournalFrames, scene: Scene | None = None) -> None:
         self.header = header
         self.frames = frames
+        self.warnings: tuple[str, ...] = ()  # of the run that has just made it, by its `PlateMismatch`
         if scene is not None:
             self.scene = scene
 

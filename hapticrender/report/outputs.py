@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import errno
 import os
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hapticrender.errors import PlateMismatch
 from hapticrender.formatting import as_json
 from hapticrender.loop import run
 from hapticrender.protocols import Rendering
-from hapticrender.recordings.formats import MissingExtra, write_sound
+from hapticrender.recordings.formats import MissingExtra, replacing, write_sound
 from hapticrender.recordings.journal import read_journal
 from hapticrender.recordings.recording import Recording
 from hapticrender.report import picture
@@ -54,6 +56,16 @@ def check_file(option: str, path: Path) -> None:
     check_folder(option, path.parent)
 
 
+def write_report(path: str | Path, data: bytes) -> None:
+    """Write a report, which replaces an older file when it is whole; a link, a pipe or a device is written into."""
+    path = Path(path)
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        path.write_bytes(data)
+        return
+    with replacing(path) as scratch:
+        scratch.write_bytes(data)
+
+
 def written_in(folder: Path) -> list[Path]:
     """Files in `folder` that have the names of a run's files."""
     return [folder / name for name in FILES if (folder / name).exists()]
@@ -84,13 +96,27 @@ def naming_full(folder: str | Path) -> Iterator[None]:
         raise
 
 
+def run_to_end(rendering: Rendering, **options: Any) -> Recording:
+    """`hapticrender.loop.run`, in which a device that differs from its model is no error where warnings are."""
+    try:
+        return run(rendering, **options)
+    except PlateMismatch as mismatch:
+        if mismatch.recording is None:
+            raise
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.warn(str(mismatch), PlateMismatch, stacklevel=2)
+        return mismatch.recording
+
+
 def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, float], None] | None = None) -> Outputs:
     """Run a prepared `rendering` and write everything about it into `folder`, which is made where it is not there.
 
     Files of an earlier run are removed first, so that all files are of this run, also after an interruption.
     """
     with naming_full(folder):
-        return write_outputs(folder, run(rendering, journal=begin_outputs(folder, rendering.scene), progress=progress))
+        journal = begin_outputs(folder, rendering.scene)
+        return write_outputs(folder, run_to_end(rendering, journal=journal, progress=progress))
 
 
 def begin_outputs(folder: Path, scene: Scene) -> Path:

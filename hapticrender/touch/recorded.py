@@ -32,6 +32,7 @@ STREAMED = 2**31 - 2**16  # bytes: a length from here on was not known when the 
 _PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+) \(should be (\d+)\)", re.MULTILINE)
 FELT = (20.0, 1000.0)  # Hz: what is played by default, up to where vibration is felt, or
 CARRIED = (20.0, 400.0)  # where carriers are chosen
+ENDS = 3.0  # periods of the lowest frequency: so far a kink where a recording is reflected reaches (a sine's: 0.3 %)
 GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % in them
 
 Passband = tuple[float, float]
@@ -43,6 +44,11 @@ def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
         frequency = frequency[frequency < rate / 2]
         return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
     return Bands(frequency=0 * frequency, wavenumber=frequency / speed, phase=0 * frequency)
+
+
+def _peak(values: Array, ends: int = 0) -> float:
+    """Peak of what is not constant, but for `ends` samples at each end."""
+    return float(np.abs(values[ends : max(values.size - ends, 0)] - values.mean()).max(initial=0.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +96,7 @@ class _Playback(Validated, Composable):
         elif peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
             raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
         else:
-            scale = self.amplitude / peak
+            scale = self.amplitude / min(peak, max(_peak(values), _peak(curve.values, round(ENDS / low / curve.step))))
         return Curve(curve.values * scale, curve.step)
 
     def _recorded(self) -> tuple[Array, float]:
@@ -146,8 +152,9 @@ class Recorded(_Playback):
     samples, rate : array_like, shape (n,), n >= 2, and float, Hz
         Numbers within 1e6 and their sampling rate.
     amplitude, gain : float, m, or m per full scale of the file
-        Target peak, or scale; exactly one, > 0; the peak must be <= 0.01 m.  The gain that plays a recording exactly
-        often feels too weak: about 3 times as much suits fine textures, 5 times coarse ones.
+        Target peak, or scale; exactly one, > 0; the peak must be <= 0.01 m.  What the filter adds where the recording
+        is reflected is not part of the peak: a sine that begins at phase 0 is up to 14 % larger there.  The gain that
+        plays a recording exactly often feels too weak: about 3 times as much suits fine textures, 5 times coarse ones.
     channel : int
         Counted from 0.
     speed : float, m/s, or None
