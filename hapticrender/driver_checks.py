@@ -57,10 +57,11 @@ def check_channels(driver: Any, drive: Mapping[int, str], sensed: Mapping[int, s
         require(found in known, f"driver.{name}", found, bound)
 
 
-def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
+def check_sensed(driver: Any, sensed: Sensed, places: int, stated: bool = False) -> Sensed:
     """Return a block that `driver` returned with copies of its columns, contiguous float64 (flags int64).
 
-    A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns.
+    A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns,
+    and may not be missing once it was `stated`: a recording has one source of it.
     """
     block = driver.block
     shapes = {
@@ -76,6 +77,9 @@ def check_sensed(driver: Any, sensed: Sensed, places: int) -> Sensed:
         if value is None and name != "sensed":
             continue
         columns[name] = _column(driver, name, value, shape)
+    if stated and "motion" not in columns:
+        kind = type(driver).__name__
+        raise ProtocolError(f"{kind}: play: motion is None, and was stated before: must be stated in every block")
     return Sensed(**columns)
 
 

@@ -109,7 +109,8 @@ class LiveLoop(RealtimeEntry):
 
         `late`: the device lost samples before it.
         """
-        sensed = check_sensed(self.driver, self.driver.play(self._drive), len(self.model.places))
+        places, stated = len(self.model.places), self._has_motion
+        sensed = check_sensed(self.driver, self.driver.play(self._drive), places, stated)
         at = (self.samples + np.arange(self.driver.block)) % len(self._true)
         if sensed.motion is not None:
             self._true[at, :-1], self._has_motion = sensed.motion, True

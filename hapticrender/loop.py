@@ -307,7 +307,7 @@ class _Loop:
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
-        self._late = 0.0  # samples after which it is
+        self._late, self._has_motion = 0.0, False  # samples after which it is; whether the device states it
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -351,7 +351,9 @@ class _Loop:
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
         driver, played = self.rendering.driver, self._drive
-        sensed = check_sensed(driver, driver.play(played.copy()), len(self.rendering.model.places))
+        places = len(self.rendering.model.places)
+        sensed = check_sensed(driver, driver.play(played.copy()), places, self._has_motion)
+        self._has_motion = sensed.motion is not None
         self._itself |= stops_itself(sensed, self.controller)
         position = sensed.position
         if position is None:

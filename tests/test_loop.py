@@ -5,6 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from live_devices import Told
 
 import hapticrender as hr
 from hapticrender import loop
@@ -183,3 +184,20 @@ def test_what_the_device_cannot_do_is_refused_before_anything_is_written(scene, 
     with pytest.raises(ValueError, match=message):
         hr.render(scene, journal=tmp_path / "run.au")
     assert not list(tmp_path.iterdir())
+
+
+def play(driver):
+    with hr.Player(driver=driver, paced=False) as player:
+        player.play(TONE.texture)
+        player.sleep(0.5)
+
+
+@pytest.mark.parametrize("run", [play, partial(hr.render, TONE)], ids=["live", "render"])
+def test_motion_that_a_device_states_and_then_does_not_is_refused(run):
+    """The rest would come from the sensors, under the name of the first source."""
+    plate = Plate(PlateParameters(), hr.Finger.absent())
+    driver = Told(plate, lambda sample, sensed: sensed if sample < 1000 else sensed._replace(motion=None))
+    driver.probe = False
+    with pytest.raises(hr.ProtocolError, match="Told: play: motion is None, and was stated before: must be"):
+        run(driver=driver)
+    assert len(driver.played) == 1001 + 1  # and zero drive
