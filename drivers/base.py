@@ -3,7 +3,7 @@
 A driver carries samples to a device, a file or a plant model, and back.  Any object is one that has
 
 ``rate``
-    sampling rate, Hz
+    sampling rate, Hz, <= 1e7
 ``drive_channels``, ``sensed_channels``
     how many columns it takes and gives; no sensed channel means that the device is driven open loop
 ``block``

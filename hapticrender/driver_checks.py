@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
@@ -17,6 +16,7 @@ from hapticrender.protocols import Array, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
+MOST_RATE = 1e7  # Hz: of the fastest device that parameters can state; filters and logs take memory by it
 OPEN: set[int] = set()  # identities of the devices that play
 
 
@@ -41,8 +41,8 @@ def check_driver(driver: Any) -> None:
     if missing:
         raise TypeError(f"{kind} is no driver: it lacks {', '.join(missing)}")
     rate = driver.rate
-    if not isinstance(rate, Real) or not 0.0 < float(rate) < math.inf:
-        raise ValueError(f"{kind}: rate={rate!r} must be finite and > 0 Hz")
+    if not isinstance(rate, Real) or not 0.0 < float(rate) <= MOST_RATE:
+        raise ValueError(f"{kind}: rate={rate!r} must be finite and > 0 Hz, and <= {MOST_RATE:g} Hz")
     for name, least in (*_LEAST.items(), ("delay", driver.block)):
         value = getattr(driver, name)
         if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
@@ -63,7 +63,9 @@ def check_sensed(driver: Any, sensed: Sensed, places: int, stated: bool = False)
     A `ProtocolError` names the column that has no numbers, or not the driver's shape; `motion` has `places` columns,
     and may not be missing once it was `stated`: a recording has one source of it.
     """
-    block = driver.block
+    block, kind = driver.block, type(driver).__name__
+    if not hasattr(sensed, "sensed"):
+        raise ProtocolError(f"{kind}: play returned {type(sensed).__name__}: must return a hapticrender.Sensed")
     shapes = {
         "sensed": (block, driver.sensed_channels),
         "position": (block,),
@@ -78,7 +80,6 @@ def check_sensed(driver: Any, sensed: Sensed, places: int, stated: bool = False)
             continue
         columns[name] = _column(driver, name, value, shape)
     if stated and "motion" not in columns:
-        kind = type(driver).__name__
         raise ProtocolError(f"{kind}: play: motion is None, and was stated before: must be stated in every block")
     return Sensed(**columns)
 

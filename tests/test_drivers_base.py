@@ -123,3 +123,10 @@ def test_a_column_that_would_lose_something_is_refused(columns, message):
     assert check_sensed(Diary(), Sensed(np.ones((4, 1)), flags=np.full(4, 8.0)), 0).flags.dtype == np.int64
     with pytest.raises(ProtocolError, match=message):
         check_sensed(Diary(), Sensed(**{"sensed": np.ones((4, 1))} | columns), 0)
+
+
+@pytest.mark.parametrize("found", [np.ones((4, 1)), (np.ones((4, 1)),), None])
+def test_what_is_no_sensed_block_is_named_by_its_kind(found):
+    kind = type(found).__name__
+    with pytest.raises(ProtocolError, match=f"^Diary: play returned {kind}: must return a hapticrender.Sensed$"):
+        check_sensed(Diary(), found, 0)

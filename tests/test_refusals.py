@@ -320,6 +320,7 @@ DRIVERS = [
     (lambda: entry().finger(0.0, np.nan), "must be finite"),
     (lambda: entry().set_gain(np.nan), "gain = nan"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
+    (lambda: driver(rate=1e9), r"BaseDriver: rate=1000000000.0 must be finite and > 0 Hz, and <= 1e\+07 Hz"),
     (lambda: driver(block=0), r"block=0 must be a whole number >= 1"),
     (lambda: driver(sensed_channels=-1), r"sensed_channels=-1 must be a whole number >= 0"),
     (lambda: driver(delay=3), r"delay=3 must be a whole number >= 4"),
