@@ -116,6 +116,11 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
         ),
         ({"flags": np.full(4, np.nan)}, "flags is no array of whole numbers"),
         ({"flags": np.full(4, np.inf)}, "flags is no array of whole numbers"),
+        (
+            {"flags": np.array([0, 256, 8, 2**40])},
+            f"flags has bits {2**40 + 256}, must be of hapticrender.Flag, 0 to 255",
+        ),
+        ({"flags": np.full(4, -1)}, "flags has bits -256, must be of hapticrender.Flag"),
         ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
     ],
 )
