@@ -62,7 +62,9 @@ class VibrotactileRenderer(BaseRenderer):
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
         assumed, coils = setup.assumed, setup.assumed.coils
-        check_channels(driver, {coils: "one a coil"}, {2: "one an end", 0: "open loop"})
+        other = {1: 2, 2: 1}[coils]
+        meaning = f"one a coil; of a plate with {other}: [device] coils = {other}"
+        check_channels(driver, {coils: meaning}, {2: "one an end", 0: "open loop"})
         plate = getattr(driver, "plant", None)
         own = isinstance(plate, Plate) and plate.parameters is setup.simulated
         # that of a simulated plate may differ from what is assumed; a driver may state less than was identified

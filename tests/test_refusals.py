@@ -351,6 +351,10 @@ DRIVERS = [
         "driver.rate = 79999: must be >= 80000 Hz where output = 'carrier', 4 samples a turn",
     ),
     (lambda: on_users(*TO_CARRIER), "driver.sensed_channels = 1: must be 0 where output = 'carrier'"),
+    (
+        lambda: opened("vt-plate", driver=driver(drive_channels=1)),
+        r"driver.drive_channels = 1: must be 2 \(one a coil; of a plate with 1: \[device\] coils = 1\)",
+    ),
     (lambda: opened("hybrid", driver=driver(rate=10e3)), r"driver.drive_channels = 2: must be 3"),
 ]
 DESIGNS = [
