@@ -3,7 +3,7 @@
 A driver carries samples to a device, a file or a plant model, and back.  Any object is one that has
 
 ``rate``
-    sampling rate, Hz
+    sampling rate, Hz, <= 1e7
 ``drive_channels``, ``sensed_channels``
     how many columns it takes and gives; no sensed channel means that the device is driven open loop
 ``block``
@@ -54,7 +54,8 @@ that drive could act: with ``block = 1`` the next drive acts one interval after 
 finger's position (m from the middle, NaN while lifted) or load (N) comes with the block where it is measured.
 
 A wrong argument (a shape, a NaN) is a ``ValueError`` before anything is played; a device that is absent, too slow or
-gone is a `DriverError` that names device and operation; samples lost or cut are `Flag` bits in ``Sensed.flags``.
+gone is a `DriverError` that names device and operation; samples lost or cut are `Flag` bits in ``Sensed.flags``, which
+has no others.  Motion that has been stated is stated in every later block.
 
 Nothing has to be inherited.  Here is a whole driver, a plate on two coils with a sensor at each end of its glass:
 
