@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import errno
 import inspect
+import warnings
+import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -26,6 +28,8 @@ EXTRAS = (  # package, extra, what it is good for
     ("distributed", "cluster", "sweeps on a cluster"),
 )
 SIMULATED = "simulated"
+SCALES = ("drive_per_full_scale", "sensed_per_full_scale", "delay")  # entries of a calibration that a driver takes
+_MADE: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by `open_driver`, by their id
 FORMS = "NAME, NAME:ARGUMENT, or package.module:callable for one of your own"
 
 
@@ -53,7 +57,7 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
     profile : DeviceProfile, optional
         Of the device: a driver gets those entries of its calibration, by keyword, that its parameters name
         (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter
-        ``profile`` the profile itself.
+        ``profile`` the profile itself.  A warning names what is stated and not taken.
     overwrite : bool
         Handed, where true, to a driver that has a parameter of that name.
 
@@ -84,9 +88,37 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
     try:
         with naming_driver(text, ValueError, TypeError):
             options = {"overwrite": True} if overwrite and "overwrite" in inspect.signature(factory).parameters else {}
-            return factory(*[argument] * bool(colon), **_calibration(factory, profile), **options)  # type: ignore[no-any-return]
+            made = factory(*[argument] * bool(colon), **_calibration(factory, profile), **options)
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
+    warn_of_calibration(text, profile, lambda name, _: {name, "profile"} & set(inspect.signature(factory).parameters))
+    with suppress(TypeError):  # of what cannot be referred to weakly
+        _MADE[id(made)] = made
+    return made  # type: ignore[no-any-return]
+
+
+def check_calibration(driver: Driver, profile: DeviceProfile) -> None:
+    """Warn where a profile states what an object of the caller's does not have: it gets nothing of a profile.
+
+    An attribute of the entry's name and value says that it was taken; a `delay` may be longer.
+    """
+
+    def takes(name: str, value: float) -> bool:
+        return getattr(driver, name, None) == value or (name == "delay" and getattr(driver, name, 0) >= value - 0.5)
+
+    if _MADE.get(id(driver)) is not driver and not hasattr(driver, "plant"):
+        warn_of_calibration(type(driver).__name__, profile, takes)
+
+
+def warn_of_calibration(who: str, profile: DeviceProfile | None, takes: Callable[[str, float], Any]) -> None:
+    """Warn of the entries of a calibration that a driver does not take; `gain_uncertainty` is the recording's."""
+    stated = {name: getattr(profile and profile.calibration, name, None) for name in SCALES}
+    lost = [f"{name} = {value:g}" for name, value in stated.items() if value is not None and not takes(name, value)]
+    if lost:
+        cure = "give a driver these numbers itself, and keep them as its attributes, or a parameter of that name"
+        warnings.warn(
+            f"calibration: {', '.join(lost)}: {who} does not take it, so it has no effect: {cure}", stacklevel=4
+        )
 
 
 @contextmanager

@@ -22,7 +22,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
-from hapticrender.devices import open_driver
+from hapticrender.devices import check_calibration, open_driver
 from hapticrender.devices import registered as registered
 from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
@@ -62,6 +62,8 @@ def prepare(
     scene = replace(scene, **{key: value for key, value in changes.items() if value is not None})
     if isinstance(driver, str):
         driver = open_driver(driver, scene.device_profile)
+    elif driver is not None:
+        check_calibration(driver, scene.device_profile)
     if driver is not None and getattr(driver, "finger", driver) is None:
         driver.finger = scene.finger  # type: ignore[attr-defined]
     refuse_to_overwrite(scene.texture, getattr(driver, "path", None))

@@ -1,6 +1,7 @@
 """Drivers chosen by a text, the same on the command line and in Python, and what `hapticrender devices` shows."""
 
 import sys
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -50,7 +51,34 @@ def test_a_driver_gets_what_it_names_of_its_profile_and_no_more():
     profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0, "gain_uncertainty": 0.1})
     made = open_driver("test_devices:Calibrated", profile)
     assert (made.scale, made.delay, made.profile) == (2.0, 1, profile)  # no delay was measured: its own
-    assert open_driver("other_plate:OtherPlate", profile).rate == 5000.0  # names none
+    with pytest.warns(UserWarning, match="drive_per_full_scale = 2: other_plate:OtherPlate does not take it"):
+        assert open_driver("other_plate:OtherPlate", profile).rate == 5000.0  # names none
+
+
+@pytest.mark.parametrize(
+    ("stated", "attributes", "lost"),
+    [
+        ({"sensed_per_full_scale": 5.0, "delay": 197.4}, {}, "sensed_per_full_scale = 5, delay = 197.4: OtherPlate"),
+        ({"sensed_per_full_scale": 5.0}, {"sensed_per_full_scale": 4.0}, "sensed_per_full_scale = 5: OtherPlate"),
+        ({"sensed_per_full_scale": 5.0, "delay": 1.4}, {"sensed_per_full_scale": 5.0}, ""),
+        ({"gain_uncertainty": 0.1}, {}, ""),
+    ],
+)
+def test_a_calibration_that_a_driver_object_does_not_have_is_named(stated, attributes, lost):
+    driver = OtherPlate()
+    vars(driver).update(attributes)
+    scene = hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=1e-5), duration=0.1, calibration=stated)
+    with pytest.warns(UserWarning, match=lost) if lost else nullcontext():
+        hr.prepare(scene, driver=driver, compiled=False)
+
+
+def test_a_driver_made_for_a_scene_is_not_asked_again():
+    scene = hr.Scene(
+        texture=hr.Grating(frequency=80.0, amplitude=1e-5), duration=0.1, calibration={"drive_per_full_scale": 2.0}
+    )
+    with pytest.warns(UserWarning, match="has no effect") as caught:
+        hr.prepare(scene, driver=open_driver("other_plate:OtherPlate", scene.device_profile), compiled=False)
+    assert len(caught) == 1
 
 
 REFUSED = [
