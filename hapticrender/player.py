@@ -461,6 +461,7 @@ class Player(Addressed):
             loop.fill()  # says whether a board is there
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
+        fault = loop.fault()  # before the signals are read, so that all of what led to it is recorded
         first, signals = loop.signals(self._recorded)
         gap, self._recorded = first - self._recorded, first + len(signals["flags"])
         if isinstance(loop, LiveLoop):
@@ -472,7 +473,7 @@ class Player(Addressed):
             except OSError as error:
                 self._unwritten = error
                 self._close_recorder(stopped=False)
-        if self._error is None and (fault := loop.fault()):
+        if self._error is None and fault:
             self._error = fault
             if isinstance(fault, WatchdogTimeout):
                 self._error = WatchdogTimeout(fault.time, self._watchdog)
