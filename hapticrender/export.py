@@ -81,8 +81,8 @@ def _memory(sizes: dict[str, int]) -> str:
     """State the static memory of a board of these sizes."""
     taken = OTHER_BYTES + (PAST_BYTES if sizes["DAMPER_TAPS"] > 16 else 0)
     taken = -(-(taken + sum(each * sizes[name] for name, each in BYTES.items())) // 8) * 8
-    told = f"/* Bytes of board_t, with real_t and pointers of 4: {taken + 65_536} with the textures of texture.h. */"
-    return f"{told}\n#define BOARD_BYTES ({taken}u + 8u * TEXTURE_RING + 4u * TEXTURE_POINTS)\n"
+    note = f"/* Bytes of board_t, with real_t and pointers of 4: {taken + 65_536} with the textures of texture.h. */"
+    return f"{note}\n#define BOARD_BYTES ({taken}u + 8u * TEXTURE_RING + 4u * TEXTURE_POINTS)\n"
 
 
 def sources() -> list[Path]:

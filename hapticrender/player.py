@@ -19,8 +19,7 @@ import atexit
 import math
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -38,13 +37,13 @@ from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
+from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, hold_to_clock
 from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
-from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import MOST_LOAD, Finger
 from hapticrender.touch.scene import Scene
 
@@ -55,7 +54,6 @@ LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end, as i
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
-LEAST_PART = 2 * SERVICE  # s: of a playlist whose parts are taken up one by one
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
 TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up
 
@@ -123,8 +121,7 @@ class Player(Addressed):
         self._finger_time = 0.0  # and when
         self._loop: LiveLoop | None = None
         self._gain, self._lost = 1.0, 0
-        self._parts: deque[tuple[Rendering, float]] = deque()  # of a playlist, and how long (s); the first plays ...
-        self._until = math.inf  # s: ... until then
+        self._playlist = LivePlaylist()
         self._error: BaseException | None = None
         self._raised = False
         self._recorder: Recorder | None = None
@@ -192,43 +189,32 @@ class Player(Addressed):
         DeviceFault, DriverError
             The device has failed.
         """
-        parts = texture.parts if isinstance(texture, Playlist) and texture.spatial else ((texture, math.inf),)
-        shortest = min(seconds for _, seconds in parts)
-        if shortest < LEAST_PART:
-            raise ValueError(f"a part of {shortest:g} s of a playlist along the surface: must be >= {LEAST_PART:g} s")
+        parts = parts_of(texture)
         with self._changing, self._busy():  # the device goes on: a long recording takes seconds to prepare
             scenes = [self._scene(texture=each) for each, _ in parts]
             loop = self._loop
             if loop is None:
                 with self._lock:
                     self._check()
-                    self._follow(self._begin(scenes), parts)
+                    self._playlist.begin(self._begin(scenes), parts, self.time)
                 return
             renderings = [self._prepare(each) for each in scenes]
             made, *_ = [loop.made(each) for each in renderings]
             with self._lock:
                 self._check()
                 loop.replace(renderings[0], *made)
-                self._follow(renderings, parts)
+                self._playlist.begin(renderings, parts, self.time)
 
     def _prepare(self, scene: Scene) -> Rendering:
         """Return the rendering of a scene on the device that plays."""
         playing = self._playing("play").rendering
         return prepare(scene, driver=None if playing.plant is not None else playing.device, compiled=False)
 
-    def _follow(self, renderings: list[Rendering], parts: Sequence[tuple[Texture, float]]) -> None:
-        """Note what follows the first of the renderings, and when."""
-        self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
-        self._until = self.time + self._parts[0][1]
-
     def _go_on(self) -> None:
         """Fade into the next part of a playlist where it is due."""
-        if self.time >= self._until:
-            self._parts.rotate(-1)
-            rendering, seconds = self._parts[0]
+        if rendering := self._playlist.due(self.time):
             loop = self._playing("play")
             loop.replace(rendering, *loop.made(rendering))
-            self._until += seconds
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).

@@ -1,5 +1,6 @@
 """Recordings of motions that are known in closed form."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,3 +80,10 @@ def make_play(reference: Any, motion: Any, **fields: Any) -> Recording:
     signals = make_signals(bands, np.zeros(0), duration=n / RATE)
     recorder.append(**signals | {"motion": motion, "reference": np.asarray(reference)})
     return recorder.finish()
+
+
+def summary_of(bands, signals, header=None, **scene):
+    recorder = make_recorder(None, bands, **scene)
+    recorder.header = replace(recorder.header, **(header or {}))
+    recorder.append(**signals)
+    return recorder.finish().summary()

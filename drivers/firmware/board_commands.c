@@ -75,7 +75,7 @@ static uint8_t limits(board_t *board, const frame *from)
           time >= REAL(1e-3) && time <= REAL(1e3) && displacement > REAL(0.0))) {
         return REASON_VALUE;
     }
-    board->peak = peak = real_min(peak, design.drive_limit);    /* the host knows it as a float */
+    board->peak = peak = real_min(peak, design.drive_limit);    /* the host has it as a float */
     board->rms = rms;
     board->displacement = board->supervisor.sensed_bound = real_min(displacement, supervision.sensed_bound);
     board->heating = real_min(REAL(1.0) / (time * board->played.rate), REAL(1.0));

@@ -1,0 +1,68 @@
+"""Live play on a device without a clock of its own, or with another one than the application's."""
+
+import threading
+import time
+from functools import partial
+from types import SimpleNamespace
+
+import pytest
+from live_devices import TONE, Lying
+
+import hapticrender as hr
+from hapticrender import live_threads
+
+
+@pytest.mark.parametrize("slow", [True, False])
+def test_a_device_that_is_left_behind_by_the_clock_has_lost_samples(slow):
+    class Slow(Lying):
+        def _play(self, drive):
+            if slow and 100 < self.count <= 130:
+                time.sleep(0.02)  # a sample
+            return super()._play(drive)
+
+    with hr.Player(driver=Slow(1e9, "")) as player:
+        player.play(TONE)
+        player.sleep(0.8)
+        assert (hr.Flag.OVERRUN in player.state().flags) == slow
+
+
+class Device:
+    """What `hold_to_clock` sees of a loop on a real device whose own clock is off: time passes within `play` only."""
+
+    def __init__(self, takes, opening=0.0):
+        self.driver, self.rendering = SimpleNamespace(block=25, rate=5000.0), SimpleNamespace(plant=None)
+        self.samples, self.now, self.slept, self.takes, self.opening = 0, 0.0, 0.0, takes, opening
+
+    def monotonic(self):
+        return self.now
+
+    def sleep(self, seconds):
+        self.slept += seconds
+        self.now += seconds
+
+    def play(self, stopping, found, late):
+        self.now += self.takes * 5e-3 + (self.opening if not self.samples else 0.0)
+        self.samples += 25
+        found.append(late)
+        if self.samples >= 500_000:  # 100 s
+            stopping.set()
+
+
+@pytest.mark.parametrize(
+    ("takes", "opening", "late"), [(1.009, 0.0, False), (0.991, 0.0, False), (1.0, 0.5, False), (1.02, 0.0, True)]
+)
+def test_a_clock_of_its_own_may_be_a_hundredth_off(monkeypatch, takes, opening, late):
+    """It is neither late, where it is slower, nor kept waiting, where it is faster; opening a stream is not late."""
+    device, stopping, found = Device(takes, opening), threading.Event(), []
+    monkeypatch.setattr(live_threads, "time", device)
+    live_threads.hold_to_clock(device, partial(device.play, stopping, found), stopping)
+    assert any(found) == late
+    assert device.slept == 0.0
+
+
+def test_a_device_that_does_not_wait_is_held_to_the_clock(monkeypatch):
+    """To the hundredth that a clock of its own may be off."""
+    device, stopping = Device(0.0), threading.Event()
+    monkeypatch.setattr(live_threads, "time", device)
+    live_threads.hold_to_clock(device, partial(device.play, stopping, []), stopping)
+    assert device.now == pytest.approx(100.0, rel=0.0101)
