@@ -79,21 +79,18 @@ def _operator(function: Any, act: Callable[..., Any], kind: Any = None) -> None:
         (a, b), (x, y) = (_parts(builder, *each) for each in zip(signature.args, values, strict=True))
         return _value(builder, signature.return_type, *act(builder, a, b, x, y))
 
-    for other in (Vector, types.Float, types.Integer):
-        lower_builtin(function, Vector, other)(build)
-        if other is not Vector:
-            lower_builtin(function, other, Vector)(build)
+    number, integer = types.Float, types.Integer
+    for kinds in ((Vector, Vector), (Vector, number), (number, Vector), (Vector, integer), (integer, Vector)):
+        lower_builtin(function, *kinds)(build)
 
 
 def _of_llvm(name: str) -> Callable[..., Any]:
     """Code of a function that LLVM has an intrinsic of."""
 
     def act(builder: Any, *lanes: Any) -> Any:
-        lanes, full = tuple(each for each in lanes if each is not None), f"llvm.{name}.v{W}f64"
-        function = builder.module.globals.get(full)
-        if function is None:
-            function = ir.Function(builder.module, ir.FunctionType(LANES, [LANES] * len(lanes)), full)
-        return builder.call(function, lanes)
+        lanes = tuple(each for each in lanes if each is not None)
+        kind = ir.FunctionType(LANES, [LANES] * len(lanes))
+        return builder.call(builder.module.declare_intrinsic(f"llvm.{name}.v{W}f64", (), kind), lanes)
 
     return act
 
@@ -106,9 +103,8 @@ def _each(name: str) -> Callable[..., Any]:
 
     def act(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
         combine = getattr(builder, name)
-        if b is None and y is None:
-            return combine(a, x), None
-        return combine(a, x), combine(*(ZERO if each is None else each for each in (b, y)))
+        imag = None if b is y is None else combine(*(ZERO if each is None else each for each in (b, y)))
+        return combine(a, x), imag
 
     return act
 
@@ -181,11 +177,9 @@ def put(typingctx: Any, tile: Any, name: Any, vector: Any) -> Any:
 @intrinsic
 def load(typingctx: Any, address: Any) -> Any:
     """Load the real vector at an address, which is a multiple of 64 bytes."""
-
-    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        return builder.load(builder.inttoptr(values[0], ir.PointerType(LANES)), align=64)
-
-    return REAL(types.int64), build
+    return REAL(types.int64), lambda context, builder, signature, values: builder.load(
+        builder.inttoptr(values[0], ir.PointerType(LANES)), align=64
+    )
 
 
 @intrinsic
@@ -204,6 +198,14 @@ def where(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
         return _value(builder, signature.return_type, *(builder.select(values[0], *both) for both in pairs))
 
     return (COMPLEX if COMPLEX in (a, b) else REAL)(mask, a, b), build
+
+
+@intrinsic
+def fused(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
+    """Return a b + c of real vectors or numbers, rounded once."""
+    return REAL(a, b, c), lambda context, builder, signature, values: FUSED(
+        builder, *(_parts(builder, *each)[0] for each in zip(signature.args, values, strict=True))
+    )
 
 
 def _of_one(kind: Any, act: Callable[..., Any]) -> Any:
@@ -242,9 +244,6 @@ conj = _of_one(COMPLEX, lambda builder, real, imag: _value(builder, COMPLEX, rea
 square = _of_one(REAL, lambda builder, real, imag: builder.fadd(builder.fmul(real, real), builder.fmul(imag, imag)))
 sqrt, nearest, magnitude = (_of_one(REAL, _of_llvm(name)) for name in ("sqrt", "rint", "fabs"))
 total = _of_one(types.float64, _total)  # sum over the lanes
-some = _of_one(
-    types.boolean,
-    lambda builder, mask, _: builder.icmp_unsigned("!=", builder.bitcast(mask, BITS), ir.Constant(BITS, 0)),
-)
+some = _of_one(types.boolean, lambda builder, mask, _: builder.icmp_unsigned("!=", builder.bitcast(mask, BITS), NONE))
 pair = _of_two(COMPLEX, lambda builder, real, imag: _value(builder, COMPLEX, real, imag))
 minimum, maximum = (_of_two(REAL, _of_llvm(name)) for name in ("minnum", "maxnum"))

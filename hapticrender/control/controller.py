@@ -128,7 +128,7 @@ class BankController(Addressed):
         }
         signals = addresses(drive=drive, target=target, flags=flags, **arrays)
         self.step(self.state.ctypes.data, signals.ctypes.data, 0, n)
-        return drive, np.repeat(target, self.block, axis=0), flags
+        return drive, np.repeat(target, self.block, axis=0) if self.block > 1 else target, flags
 
 
 class PositionPredictor:

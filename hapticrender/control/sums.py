@@ -30,7 +30,7 @@ from hapticrender.control.records import (
 )
 from hapticrender.jit import kernel, record
 from hapticrender.mathx import unit
-from hapticrender.vectors import conj, get, imag, pair, put, real, total, zeros
+from hapticrender.vectors import conj, fused, get, imag, pair, put, real, total, zeros
 
 
 @kernel
@@ -64,6 +64,26 @@ def turn_tables(controller):
 
 
 @kernel
+def sum_pairs(controller, k, other, i, rising):
+    """Sums over the bands for pairs k and `other` of a group in coordinate i: Re y cos and Im y sin of either."""
+    c = record(controller, CONTROLLER_T, 0)
+    even0, odd0, slope_even0, slope_odd0 = zeros(), zeros(), zeros(), zeros()
+    even1, odd1, slope_even1, slope_odd1 = zeros(), zeros(), zeros(), zeros()
+    for t in range(c.tiles):
+        w, z0 = record(c.work_at, WORK_T, 2 * t + i), get(record(c.table_at, PAIR_T, k * c.tiles + t), "z")
+        y, z1 = get(w, "y"), get(record(c.table_at, PAIR_T, other * c.tiles + t), "z")
+        even0, odd0 = fused(real(y), real(z0), even0), fused(imag(y), imag(z0), odd0)
+        even1, odd1 = fused(real(y), real(z1), even1), fused(imag(y), imag(z1), odd1)
+        if rising:
+            up = get(w, "up")
+            slope_even0, slope_odd0 = fused(imag(up), imag(z0), slope_even0), fused(real(up), real(z0), slope_odd0)
+            slope_even1, slope_odd1 = fused(imag(up), imag(z1), slope_even1), fused(real(up), real(z1), slope_odd1)
+    first = 0.5 * (c.p.group - 1) - ((c.p.group + 1) // 2 - 1)  # distance of pair 0 from the middle
+    even0, odd0 = even0 - (first + k) * slope_even0, odd0 - (first + k) * slope_odd0
+    return even0, odd0, even1 - (first + other) * slope_even1, odd1 - (first + other) * slope_odd1
+
+
+@kernel
 def sum_bands(controller, count, rising):
     """Sum Re(x z[m]) over the bands for `count` envelopes x, which may rise linearly over the block; rows SUM."""
     c = record(controller, CONTROLLER_T, 0)
@@ -82,19 +102,15 @@ def sum_bands(controller, count, rising):
                     x = x + share * get(w, "rise")
                     put(w, "up", get(w, "rise") * z * (1.0 / block))
                 put(w, "y", x * z)
-        for k in range(pairs):
-            distance = middle - (pairs - 1 - k)
-            early, late = q * group + pairs - 1 - k, q * group + group - pairs + k
+        for k in range(0, pairs, 2):  # two pairs at a time: a sum waits for the one before it
+            other = min(k + 1, pairs - 1)
             for i in range(count):
-                even, odd = zeros(), zeros()
-                for t in range(tiles):
-                    w, z = record(c.work_at, WORK_T, 2 * t + i), get(record(c.table_at, PAIR_T, k * tiles + t), "z")
-                    y = get(w, "y")
-                    even, odd = even + real(y) * real(z), odd + imag(y) * imag(z)
-                    if rising:
-                        z, up = distance * z, get(w, "up")
-                        even, odd = even - imag(up) * imag(z), odd - real(up) * real(z)
-                samples[SUM + i, early], samples[SUM + i, late] = total(even + odd), total(even - odd)
+                even0, odd0, even1, odd1 = sum_pairs(controller, k, other, i, rising)
+                early, late = q * group + pairs - 1, q * group + group - pairs
+                samples[SUM + i, early - k] = total(even0 + odd0)
+                samples[SUM + i, late + k] = total(even0 - odd0)
+                samples[SUM + i, early - other] = total(even1 + odd1)
+                samples[SUM + i, late + other] = total(even1 - odd1)
 
 
 @kernel
@@ -121,7 +137,7 @@ def correlate(controller, row, count):
                 even, odd = zeros(), zeros()
                 for k in range(pairs):
                     z, m = get(record(c.table_at, PAIR_T, k * tiles + t), "z"), q * group + k
-                    even, odd = even + samples[FOLDED, m] * real(z), odd + samples[FOLDED + 1, m] * imag(z)
+                    even, odd = fused(samples[FOLDED, m], real(z), even), fused(samples[FOLDED + 1, m], imag(z), odd)
                 x = x + pair(even, odd) * get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
             put(record(c.work_at, WORK_T, 2 * t + i), "x", x)
 
