@@ -111,10 +111,11 @@ class NaiveError:
         T, a = self.T, TRACKER
         jumped = self.seen and abs(position - self.x) > FASTEST * T
         if jumped or not abs(position) <= FAR:
-            self.seen, self.velocity, self.acceleration = False, 0.0, 0.0
+            self.seen, self.acceleration = False, 0.0
             self.speed, self.fresh = 0.0 if jumped else (1 - a * T) * self.speed, max(self.fresh - 1, 0)
             return
         moved = abs(position - self.x) / T if self.seen else 0.0
+        self.velocity = self.velocity if self.seen else 0.0
         predicted = (self.smooth_x if self.seen else position) + T * self.velocity
         error = position - predicted
         self.smooth_x = predicted + 3 * a * T * error

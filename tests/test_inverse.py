@@ -123,6 +123,22 @@ def test_what_once_ran_away_does_not(changes, most):
     assert recording.summary()["waveform"]["places"]["centre"]["waveform_error"] < most
 
 
+def test_a_finger_that_leaves_ridges_makes_no_click():
+    """Where it leaves, the ridges' displacement fades out; a step of it would take 25 A (the drive is cut to less).
+
+    The most that may come is that of their velocity stopped within a sample, m v/T on two coils.
+    """
+    rate, slides = 48e3, {"speed": 0.05, "normal_load": 0.01, "mechanics": "light"}
+    finger = hr.Finger.sliding(**slides, touches=[(0.0, 0.6)])
+    profile = {"rate": rate, "delay": 64, "sensor_noise": 1e-7}
+    texture = hr.Grating(wavelength=1e-3, amplitude=5e-6)
+    recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=0.8, profile=profile))
+    velocity, sag = 2 * np.pi * 50.0 * 5e-6, PLATE.stiffness_1 * 5e-6 / PLATE.force_constant
+    left = abs(recording.drive[round(0.599 * rate) :])
+    assert sag < left.max() < PLATE.mass * velocity * rate / (2 * PLATE.force_constant) + sag
+    assert left[-round(0.05 * rate) :].max() < sag
+
+
 @pytest.mark.parametrize("rate", [8e3, 10e3, 20e3])
 def test_a_faster_loop_bears_a_touch_no_worse(rate):
     """A touch of 0.4 N near an end, from 0.1 s on: with three taps at every rate 22, 27 and 66 % for 4.5 at 5 kHz."""

@@ -40,11 +40,11 @@ void finger_track(finger_t *finger, real_t position, real_t rate)
     const uint32_t leapt =
         ((was_seen != 0u) && (real_abs(position - finger->position) * rate > FASTEST)) ? 1u : 0u;
     if ((leapt != 0u) || !(real_abs(position) <= FARTHEST)) { /* NaN included */
-        finger->velocity = REAL(0.0);
         finger->acceleration = REAL(0.0);
         finger->seen = 0u;
         return;
     }
+    finger->velocity = (was_seen != 0u) ? finger->velocity : REAL(0.0);
     const real_t predicted = ((was_seen != 0u) ? finger->smooth_position : position) + period * finger->velocity;
     const real_t innovation = position - predicted;
     finger->smooth_position = predicted + REAL(3.0) * pole * innovation;

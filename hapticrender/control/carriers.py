@@ -38,17 +38,22 @@ FASTEST = 10.0  # m/s: a finger that moves faster has been put down elsewhere
 
 @kernel
 def track_finger(controller, position):
-    """Update the finger's position, velocity and acceleration: an observer with a triple pole; NaN means lifted."""
+    """Update the finger's position, velocity and acceleration: an observer with a triple pole; NaN means lifted.
+
+    The last velocity is held until the next touch, so that a target along the surface fades out where it was.
+    """
     c = record(controller, CONTROLLER_T, 0)
     period = 1.0 / c.p.rate
     pole = TRACKER_POLE * period
     leapt = c.finger_seen > 0.0 and abs(position - c.held_position) * c.p.rate > FASTEST
     if leapt or not abs(position) <= FARTHEST:
-        c.velocity = c.acceleration = c.finger_seen = 0.0
+        c.acceleration = c.finger_seen = 0.0
         c.speed = 0.0 if leapt else c.speed - pole * c.speed
         c.fresh = max(c.fresh - 1.0, 0.0)
         return
     came = c.finger_seen <= 0.0
+    if came:
+        c.velocity = 0.0
     moved = 0.0 if came else abs(position - c.held_position) * c.p.rate
     predicted = (position if came else c.smooth_position) + period * c.velocity
     innovation = position - predicted
