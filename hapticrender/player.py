@@ -31,7 +31,6 @@ import numpy as np
 
 from hapticrender.checks import number
 from hapticrender.control.carriers import FASTEST
-from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
@@ -372,8 +371,8 @@ class Player(Addressed):
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
         stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
-        if rendering.probe:
-            probe_plate(device, rendering.model)
+        if rendering.probe is not None:
+            rendering.probe(device)
         self._loop = loop
         loop.set_gain(self._gain)
         if self._finger is not None:
