@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -246,15 +245,12 @@ class LiveLoop(RealtimeEntry):
         return device_fault(self.rendering, None if self._itself else self.running, stopped)
 
     def _texture(self, rendering: Rendering) -> SampledTexture | EvaluatedTexture:
-        texture = rendering.scene.texture
         try:
-            return SampledTexture(texture, self.driver.rate, rendering.waveform_of)
+            return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
         except InseparableTexture:
             if self._calls_back:  # by a callback without Python's lock
                 raise
-        waveform = partial(rendering.bands.checked, type(texture).__name__, rendering.waveform)
-        places, position = self._arrays["places"], self._arrays["position"]
-        return EvaluatedTexture(waveform, rendering.bands.follows_finger, self.rate, self.ahead, places, position)
+        return EvaluatedTexture(rendering, self.ahead, self._arrays["places"], self._arrays["position"])
 
 
 def live_controller(rendering: Rendering) -> Controller:

@@ -8,7 +8,7 @@ at once is an `EvaluatedTexture`: compiled code calls Python for it in every blo
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numba
@@ -16,7 +16,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.jit import F8, Addressed, call, kernel, pointer, record, record_of
-from hapticrender.protocols import Array, Texture
+from hapticrender.protocols import Array, Rendering, Texture
 from hapticrender.touch.composed import PLACES, SOON, SeparatedTexture
 
 AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is later the texture fades out
@@ -116,53 +116,29 @@ class SampledTexture(Addressed):
 
 
 class EvaluatedTexture(Addressed):
-    """A texture that is a function of time and place at once, evaluated by Python in every block.
+    """The texture of a rendering, a function of time and place at once, evaluated by Python in every block.
 
-    Parameters
-    ----------
-    waveform : callable
-        Of time (s) and position (m, NaN: lifted, shape (n,)).
-    follows : bool
-        It is 0 while the finger is away; `waveform` is then evaluated at its last place.
-    rate, ahead
-        Of the controller (Hz), and how far it looks ahead (samples).
-    places : array, shape (2, block)
-        Where the finger is in a block (m), and will be the look-ahead later; last places while it is lifted.
-    position : array, shape (block,)
-        The same as the first row, NaN while it is lifted.
-
-    Attributes
-    ----------
-    error : BaseException or None
-        What `waveform` raised; the values are 0 from then on.
-
-    Raises
-    ------
-    ValueError
-        It is not the same when it is evaluated twice.
+    `places` (m, shape (2, block)) is where the finger is, and where it will be `ahead` samples later, with the last
+    place while it is lifted; `position` (m, shape (block,)) is the first row of it with NaN then.  What evaluating
+    raises is in `error`; the texture is 0 from then on.  A ValueError where it is not the same when it is evaluated
+    twice, or not finite.
     """
 
-    def __init__(
-        self,
-        waveform: Callable[[Array, Array], Array],
-        follows: bool,
-        rate: float,
-        ahead: int,
-        places: Array,
-        position: Array,
-    ) -> None:
+    def __init__(self, rendering: Rendering, ahead: int, places: Array, position: Array) -> None:
+        bands, name = rendering.bands, type(rendering.scene.texture).__name__
+        self._waveform = partial(bands.checked, name, rendering.waveform)
         tried = np.repeat(SOON, len(PLACES)), np.tile(PLACES, len(SOON))
-        if (waveform(*tried) != waveform(*tried)).any():
-            raise ValueError("texture: must not change with a reading")
-        self._waveform, self._follows, self._places, self._position = waveform, follows, places, position
-        block = len(position)
-        self._later, self._rate = np.concatenate([np.arange(block), ahead + np.arange(block)]), rate
-        self._values = np.zeros(2 * block)
+        if (self._waveform(*tried) != self._waveform(*tried)).any():
+            raise ValueError(f"{name}: must not change with a reading")
+        self._places, self._position, self._follows = places, position, bands.follows_finger
+        steps = np.arange(len(position))
+        self._later = np.concatenate([steps, ahead + steps]) / rendering.driver.rate
+        self._rate, self._values = rendering.driver.rate, np.zeros(places.size)
         self.control: Any = None  # keeps the controller that plays it alive
         self.error: BaseException | None = None
         self._read = READER(self._evaluate)
         address = ctypes.cast(self._read, ctypes.c_void_p).value
-        self.record = record_of(TEXTURE, evaluate=address, values_at=self._values, follows=follows)
+        self.record = record_of(TEXTURE, evaluate=address, values_at=self._values, follows=self._follows)
         self.address = int(self.record.ctypes.data)
 
     def _evaluate(self, sample: int) -> int:
@@ -171,7 +147,7 @@ class EvaluatedTexture(Addressed):
                 position = self._places.copy()
                 if not self._follows:
                     position[:, np.isnan(self._position)] = np.nan
-                time = np.maximum(sample + self._later, 0) / self._rate
+                time = np.maximum(sample / self._rate + self._later, 0.0)
                 self._values[:] = self._waveform(time, position.ravel())
         except BaseException as error:
             self.error, self._values[:] = error, 0.0

@@ -503,6 +503,20 @@ def test_ridges_that_wander_are_zero_while_the_finger_is_away(tmp_path):
     assert not driver.played[-1].any()
 
 
+@dataclass(frozen=True)
+class Noise(Own):
+    """White noise that is drawn anew at every reading."""
+
+    def waveform(self, time, position):
+        return 1e-6 * np.random.default_rng().standard_normal(np.shape(time))
+
+
+def test_a_texture_that_changes_with_every_reading_is_refused():
+    """What is recorded would not be what has been played."""
+    with hr.Player(paced=False) as player, pytest.raises(ValueError, match="Noise: must not change with a reading"):
+        player.play(Noise())
+
+
 def test_a_playlist_along_the_surface_plays_beside_a_tone_and_within_another():
     """As functions of time and place at once."""
     ridges = hr.Playlist([(RIDGES, 0.3), (hr.Grating(wavelength=0.5e-3, amplitude=5e-6), 0.3)])
