@@ -75,10 +75,10 @@ def probe_plate(driver: Driver, model: Any) -> None:
             played = replace(model, delay=delay, block=player.block)
             sensed, lost = _play(player, drive, places)
         last = judge(played, drive, sensed)
-        if lost > MOST_INVALID:
-            last = Found(f"{lost:.0%} of the samples were lost on the way: the probe cannot judge", np.nan, np.nan, -1)
         if not last.fault:
             return
+        if lost > MOST_INVALID:
+            last = Found(f"{lost:.0%} of the samples were lost on the way: the probe cannot judge", np.nan, np.nan, -1)
     shares = ((name, getattr(last, name)) for name in ("residual", "scale"))
     figures = [f"{name} {value:.2g}" for name, value in shares if np.isfinite(value)]
     figures += [f"delay {last.delay} samples"] * (last.delay >= 0)
