@@ -22,7 +22,9 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``drive_limit`` (optional)
     A: largest drive that it plays, below which identification stays
 ``probe`` (optional)
-    False where the start-up probe of a plate is to be left out (docs/safety.md)
+    False where the start-up probe is to be left out (docs/safety.md)
+``by_host()`` (optional)
+    of an open device with a controller of its own: the same, playing the drive of the host, in a `with` statement
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
 ``finger`` (optional)

@@ -298,7 +298,9 @@ class BoardClient(OpenedInWith):
     def begin_queue(self) -> None:
         """Let the board play what `queue` sends it, from the first row on, and stream back every sample."""
         self._steadily(lambda line: line.identify([], 0, stride=1))
-        self._runs, self._rows = True, Rows()
+        with self._lock:
+            self._open_line().streamed.clear()  # of a run before this one: no row has been queued yet
+            self._runs, self._rows = True, Rows()
 
     def queue(self, first: int, drive: Array) -> None:
         """Append rows of drive (A, shape (n, channels)), the first one of which is number `first` of the queue."""

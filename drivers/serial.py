@@ -8,7 +8,9 @@ The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's par
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -50,7 +52,7 @@ class SerialDriver(BaseDriver):
     """
 
     device_kind = "vt-plate"  # of which the firmware has the law
-    probe = False  # the law on the board is the board's; its own guards are in docs/protocol.md
+    play_delay: int  # samples, of a copy that plays the drive of the host
 
     def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
         self.client, self.options = BoardClient(port, **options), options
@@ -70,6 +72,18 @@ class SerialDriver(BaseDriver):
     def driven_by_host(self) -> SerialDriver:
         """Return the same board as a device that plays the drive of the host, for identification."""
         return self if self.block > 1 else SerialDriver(self.client.port, block=HOST_BLOCK, **self.options)
+
+    @contextmanager
+    def by_host(self) -> Iterator[SerialDriver]:
+        """Let the open board play the drive of the host, and leave it at rest."""
+        board = copy(self)
+        if self.block == 1:
+            board.block = HOST_BLOCK
+            board.play_delay = self.delay + 2 * HOST_BLOCK
+        try:
+            yield board
+        finally:
+            self.client.stop()
 
     @property
     def host_delay(self) -> int:

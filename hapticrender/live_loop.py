@@ -24,7 +24,8 @@ from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
-from hapticrender.sampled_texture import FADE, SampledTexture
+from hapticrender.sampled_texture import FADE, EvaluatedTexture, SampledTexture
+from hapticrender.touch.composed import InseparableTexture
 from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
@@ -84,6 +85,7 @@ class LiveLoop(RealtimeEntry):
         super().__init__(live_controller(rendering), frames=rendering.driver.block, **scales)
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
+        self._calls_back = bool(scales)
         rows = len(self._arrays["log"])
         self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where stated
         self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
@@ -121,6 +123,9 @@ class LiveLoop(RealtimeEntry):
         self._touches.slow()
         self._reshape()
         self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
+        for texture in self._textures:
+            if isinstance(texture, EvaluatedTexture) and texture.error is not None:
+                raise texture.error
 
     def fill_some(self) -> None:
         """As `fill`, for `SPELL` at most; what is past by then is left out."""
@@ -158,12 +163,12 @@ class LiveLoop(RealtimeEntry):
         if share == 1.0:
             self._reshaped = change
 
-    def made(self, rendering: Rendering) -> tuple[SampledTexture, Controller]:
+    def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
         whole = self.whole and self.controller.n_bands == 0
         return self._texture(rendering), self.controller if whole else live_controller(rendering)
 
-    def replace(self, rendering: Rendering, texture: SampledTexture, controller: Controller) -> None:
+    def replace(self, rendering: Rendering, texture: SampledTexture | EvaluatedTexture, controller: Controller) -> None:
         """Fade into the texture of another rendering of the same device; texture and controller are `made` of it.
 
         A controller that takes waveforms goes on; else there is a new one for the texture's bands.
@@ -239,8 +244,13 @@ class LiveLoop(RealtimeEntry):
             return WatchdogTimeout(stopped / self.driver.rate)
         return device_fault(self.rendering, None if self._itself else self.running, stopped)
 
-    def _texture(self, rendering: Rendering) -> SampledTexture:
-        return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
+    def _texture(self, rendering: Rendering) -> SampledTexture | EvaluatedTexture:
+        try:
+            return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
+        except InseparableTexture:
+            if self._calls_back:  # by a callback without Python's lock
+                raise
+        return EvaluatedTexture(rendering, self.ahead, self._arrays["places"], self._arrays["position"])
 
 
 def live_controller(rendering: Rendering) -> Controller:

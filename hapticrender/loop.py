@@ -19,7 +19,6 @@ import numpy as np
 from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.control.controller import PositionPredictor
 from hapticrender.control.device_model import DeviceModel
-from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import FADE_OUT, Fault
 from hapticrender.control.supervisor_kernel import STOPPED
 from hapticrender.devices import check_calibration, open_driver
@@ -145,8 +144,8 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
 
     device = rendering.device
     with opened_once(device), recorder, stopped_by_signal(), driver, zero_drive_after(device):
-        if rendering.probe:
-            probe_plate(device, rendering.model)
+        if rendering.probe is not None:
+            rendering.probe(device)
         loop, fault = _Loop(rendering), None
         try:
             for start in range(0, total, loop.step):

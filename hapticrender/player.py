@@ -31,7 +31,6 @@ import numpy as np
 
 from hapticrender.checks import number
 from hapticrender.control.carriers import FASTEST
-from hapticrender.control.probe import probe_plate
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
@@ -55,7 +54,7 @@ SERVICE = 0.05  # s between two looks: what comes next is computed, what was is 
 UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
-TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up
+TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up; without a call, an application
 
 
 class Player(Addressed):
@@ -78,7 +77,8 @@ class Player(Addressed):
         simulation reproducibly.
     watchdog : float, s, optional
         Where no method of this player is called for so long, the application counts as hung and the drive is stopped
-        permanently, within 10 ms; 0.1 to 60, and at least two blocks of the driver.  `sleep` counts as calls.
+        permanently, within 10 ms; 0.1 to 60, and at least two blocks of the driver; inf: never.  `sleep` counts as
+        calls.  Unless it is given: 5 s (and two blocks) while a finger that `finger` has set touches the surface.
     **tables
         Further fields of the scene, in place of a scene's own: profile, simulation, rendering, method, seed.  No
         touch_panel: that of a scene locates the finger that moves by itself, and positions passed to `finger` are taken
@@ -102,8 +102,8 @@ class Player(Addressed):
         watchdog: float | None = None,
         **tables: Any,
     ) -> None:
-        if watchdog is not None and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
-            raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or None")
+        if watchdog not in (None, math.inf) and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
+            raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or inf: never")
         if "texture" in tables:
             raise TypeError("texture: a player has none of its own: call play(texture)")
         if tables.get("touch_panel"):
@@ -127,6 +127,7 @@ class Player(Addressed):
         self._recorder: Recorder | None = None
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls = 0  # of the application that are under way
+        self._watched = math.inf  # s: the watchdog's time at the moment
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
@@ -319,17 +320,21 @@ class Player(Addressed):
         with self._lock:
             self._check()
             self._calls += 1
-            self._watch(None)
+            self._watch()
         try:
             yield
         finally:
             with self._lock:
                 self._calls -= 1
-                self._watch(None if self._calls else self._watchdog)
+                self._watch()
 
-    def _watch(self, seconds: float | None) -> None:
-        if self._watchdog is not None and self._loop is not None:
-            self._loop.watch(seconds)
+    def _watch(self) -> None:
+        """Set the watchdog: it waits while a call is under way and, unless it was given, while no finger is set."""
+        unattended = self._timeout if self._finger and not math.isnan(self._finger[0]) else math.inf
+        seconds = math.inf if self._calls else self._watchdog or unattended
+        if self._loop is not None and seconds != self._watched:
+            self._watched = seconds
+            self._loop.watch(None if seconds == math.inf else seconds)
 
     def _begin(self, scenes: list[Scene]) -> list[Rendering]:
         """Make the driver, start the device with the first scene's texture, and prepare those of the others."""
@@ -366,8 +371,8 @@ class Player(Addressed):
         rendering.driver.__enter__()
         stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
         stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
-        if rendering.probe:
-            probe_plate(device, rendering.model)
+        if rendering.probe is not None:
+            rendering.probe(device)
         self._loop = loop
         loop.set_gain(self._gain)
         if self._finger is not None:
@@ -413,6 +418,7 @@ class Player(Addressed):
         for _ in range(max(round(seconds * driver.rate / driver.block), 1)):
             self._block()
         with self._lock:
+            self._watch()
             self._go_on()
             self._playing("sleep").fill()
             self._service()
@@ -426,6 +432,7 @@ class Player(Addressed):
             with self._lock:
                 if self._stopping.is_set():
                     return
+                self._watch()
                 self._point()
                 self._go_on()
                 if due:
@@ -462,7 +469,7 @@ class Player(Addressed):
         if self._error is None and fault:
             self._error = fault
             if isinstance(fault, WatchdogTimeout):
-                self._error = WatchdogTimeout(fault.time, self._watchdog)
+                self._error = WatchdogTimeout(fault.time, self._watchdog or self._timeout)
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""
@@ -470,7 +477,9 @@ class Player(Addressed):
         if loop is None:
             return
         running = self._paced and self._error is None
-        self._watch(None)
+        with self._lock:
+            self._calls += 1  # the last one
+            self._watch()
         if gently and running:
             loop.set_gain(0.0)
             time.sleep(END_FADE)

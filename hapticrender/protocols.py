@@ -177,7 +177,7 @@ class Rendering:
     controller: Callable[[], Controller]  # a new one at rest
     design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only
     shape: Any = None  # static characteristic before the device, for this texture: `shape` of `plant`, else of `driver`
-    probe: bool = False  # whether the device is probed before the loop closes
+    probe: Callable[[Driver], None] | None = None  # checks the open device before the loop closes; None: nothing does
 
     @property
     def samples(self) -> int:

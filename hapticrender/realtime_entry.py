@@ -30,7 +30,7 @@ from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
-from hapticrender.sampled_texture import FADE, SampledTexture
+from hapticrender.sampled_texture import FADE, EvaluatedTexture, SampledTexture
 
 TOUCH_FADE = 0.02  # s: of a function of position, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
@@ -110,7 +110,7 @@ class RealtimeEntry(Addressed):
         self._slot, self._slots, self._back = np.zeros(1, SLOT), np.zeros(SLOTS, SLOT), 0
         self._slot["position"], self._slot["playing"], self._slot["gain"] = np.nan, 1, 1.0
         self._slots[:] = self._slot
-        self._textures: list[SampledTexture] = []
+        self._textures: list[SampledTexture | EvaluatedTexture] = []
         self._writing = threading.Lock()  # of threads of the application; the callback never waits
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
@@ -130,10 +130,11 @@ class RealtimeEntry(Addressed):
             "sensed": np.zeros((block, controller.sensors)),
             "drive": np.zeros((block, controller.channels)),
             "position": np.full(block, np.nan),
+            "places": np.zeros((2, block)),
             "waveform": np.zeros(block),
             "flags": np.zeros(block, np.int64),
             "bump": np.zeros(controller.channels),
-            "gains": np.zeros((self.ahead + 1, 2)),
+            "gains": np.zeros((self.ahead + block, 2)),
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
 
@@ -187,7 +188,7 @@ class RealtimeEntry(Addressed):
         PLAIN(sensed.ctypes.data, drive.ctypes.data, len(sensed), self.user_data)
         return drive
 
-    def play(self, texture: SampledTexture, controller: Any = None) -> None:
+    def play(self, texture: SampledTexture | EvaluatedTexture, controller: Any = None) -> None:
         """Fade from the texture that plays into another one, within `FADE`; one change after the other.
 
         A controller that works by bands takes another texture with a `controller` designed for it, on the same device:

@@ -14,7 +14,7 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
 from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
-from hapticrender.sampled_texture import TEXTURE_T, along_surface, in_time, smoothstep
+from hapticrender.sampled_texture import TEXTURE_T, evaluate, smoothstep, value_at
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
 HOLD = 0.25  # s: and after so long a function of position fades out
@@ -39,7 +39,9 @@ CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "a
 the state that it shares with others (see `control.state_transfer`); the drive's limit in every channel."""
 CONTROL_T = numba.from_dtype(CONTROL)
 
-_ADDRESSES = "control slots_at sensed_at drive_at position_at waveform_at flags_at bump_at gains_at log_at tracker"
+_ADDRESSES = (
+    "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at tracker"
+)
 _COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken"
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
 _STATE = "gain touch place pace offset offset_input lead lead_input open"
@@ -184,14 +186,14 @@ def follow_finger(entry, slot, m):
 
 
 @kernel
-def texture_at(entry, sample, position, gain, touch):
-    """Texture at a sample, while one fades into the next one."""
+def texture_at(entry, sample, position, gain, touch, index):
+    """Texture at a sample, while one fades into the next one; `index` of what Python has evaluated of the block."""
     e = record(entry, ENTRY_T, 0)
     (before, present), total = shares(entry, sample), 0.0
     if e.current != 0:
-        total += present * gain * (in_time(e.current, sample) + touch * along_surface(e.current, position))
+        total += present * gain * value_at(e.current, sample, position, touch, index)
     if e.previous != 0 and before > 0.0:
-        total += before * gain * (in_time(e.previous, sample) + touch * along_surface(e.previous, position))
+        total += before * gain * value_at(e.previous, sample, position, touch, index)
     return total
 
 
@@ -202,19 +204,29 @@ def play_texture(entry, slot):
     Gain and touch wait in a ring meanwhile, so that the log has what was handed to the controller.
     """
     e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
-    waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (e.ahead + 1, 2))
+    size = e.ahead + e.block
+    waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (size, 2))
+    places = carray(pointer(e.places_at, F8), (2, e.block))
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
     analysed = record(e.control, CONTROL_T, 0).analysed > 0
     for m in range(e.block):
-        now, (here, there) = e.samples + m, follow_finger(entry, slot, m)
+        places[0, m], places[1, m] = follow_finger(entry, slot, m)
         e.gain += e.gain_pole * (s.gain - e.gain)
-        gain, touch = e.gain, smoothstep(e.touch)
+        then = (e.samples + m + e.ahead) % size
+        gains[then, 0], gains[then, 1] = e.gain, smoothstep(e.touch)
+    evaluate(e.current, e.samples)
+    if e.previous != 0 and shares(entry, e.samples)[0] > 0.0:
+        evaluate(e.previous, e.samples)
+    for m in range(e.block):
+        now = e.samples + m
         before, present = shares(entry, now)
-        of_bands = gain * (before + present)
-        waveform[m] = texture_at(entry, now + e.ahead, there, gain, touch) if analysed else of_bands
-        gains[(now + e.ahead) % (e.ahead + 1), 0], gains[(now + e.ahead) % (e.ahead + 1), 1] = gain, touch
-        then = now % (e.ahead + 1)
-        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, here, gains[then, 0], gains[then, 1])
+        gain, touch = gains[(now + e.ahead) % size, 0], gains[(now + e.ahead) % size, 1]
+        if analysed:
+            waveform[m] = texture_at(entry, now + e.ahead, places[1, m], gain, touch, e.block + m)
+        else:
+            waveform[m] = gain * (before + present)
+        gain, touch = gains[now % size, 0], gains[now % size, 1]
+        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, places[0, m], gain, touch, m)
     e.age += e.block
     e.taken += e.block
 

@@ -12,6 +12,7 @@ from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.methods import method_named
+from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import supervised
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -66,7 +67,7 @@ class BaseRenderer:
             controller=partial(design, bands),
             design=design,
             shape=self.shape(setup),
-            probe=self.probes(setup, device),
+            probe=self.probe(setup, model) if self.probes(setup, device) else None,
         )
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
@@ -108,8 +109,12 @@ class BaseRenderer:
         return model
 
     def probes(self, setup: Setup, driver: Driver) -> bool:
-        """Whether the device is probed before the loop closes; see `control.probe`."""
+        """Whether the device is probed before the loop closes."""
         return False
+
+    def probe(self, setup: Setup, model: DeviceModel) -> Callable[[Driver], None]:
+        """Return what probes an open device: of a plate, its wiring."""
+        return partial(probe_plate, model=model)
 
     def waveform(self, setup: Setup, texture: Texture) -> Waveform:
         """Return the target waveform of `texture` over time (s) and position (m), in the device's quantity."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, option, parameter, require
+from hapticrender.checks import Validated, checked, flag, option, parameter, require
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.protocols import Array, Driver, Texture
@@ -35,10 +35,12 @@ class FrictionSettings(Validated):
 
     `velocity_per_force` is the skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed
     carriers.  `square_root` says whether a screen's drive is an attraction (N), or the current's envelope itself.
+    `probe` says whether a vibrating surface, or the plate of a hybrid, is probed before the loop closes.
     """
 
     velocity_per_force: float = parameter(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)
     square_root: str = option("on", "on", "off")
+    probe: bool = checked(flag, True)
 
 
 @dataclass(frozen=True)

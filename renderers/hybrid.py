@@ -154,6 +154,11 @@ class HybridRenderer(BaseRenderer):
         late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
         return HybridDriver(driver, shape, displacement, setup.velocity_per_force, late)
 
+    def probes(self, setup: HybridSetup, driver: Driver) -> bool:
+        """Whether its plate is probed, unless driver or scene say no."""
+        part = _part_of(driver, COILS, SENSORS, "plate")
+        return bool(getattr(driver, "probe", True)) and self._plate.probes(setup.plate, part)
+
     def shape(self, setup: HybridSetup) -> Any:
         """Return the square root for the screen's share of the scene."""
         return None if setup.friction is None else setup.friction.compensation
@@ -239,9 +244,10 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     with inside("simulation"):
         of_plate, on_screen = _split_table(scene.simulation, own | of_screen)
     rendering = {key: value for key, value in scene.rendering.items() if key not in own}
+    probe = {key: value for key, value in rendering.items() if key == "probe"}
     return (
         settings,
-        replace(scene, profile=plate, simulation=of_plate, rendering={}),
+        replace(scene, profile=plate, simulation=of_plate, rendering=probe),
         replace(scene, profile=screen, simulation=on_screen, rendering=rendering, limits={}),  # which are the plate's
     )
 

@@ -7,13 +7,16 @@ driver of your own gets that carrier (V) at its own rate, and senses the mode's 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import inside, require
 from hapticrender.control.device_model import Demand, DeviceModel
+from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
@@ -69,6 +72,14 @@ class UltrasonicRenderer(FrictionRenderer):
     def connect(self, setup: SurfaceSetup, driver: Driver) -> Driver:
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
         return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed), _demand(setup))
+
+    def probes(self, setup: SurfaceSetup, driver: Driver) -> bool:
+        """Whether a surface is probed: one that senses, unless driver or scene say no."""
+        return bool(setup.settings.probe and getattr(driver, "probe", True) and driver.sensed_channels)
+
+    def probe(self, setup: SurfaceSetup, model: DeviceModel) -> Callable[[Driver], None]:
+        """Return what probes an open surface: its response on the resonance."""
+        return partial(probe_resonance, mode=setup.assumed.mode)
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""

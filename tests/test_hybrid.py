@@ -1,5 +1,6 @@
 """The hybrid: shares that sum to the target, two controllers as one, plate and screen under one finger."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -109,6 +110,29 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     assert recording.header.motion_source == "sensors"  # a velocity that is computed is none that is known
 
 
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (lambda sample, sensed: sensed * [-1.0, 1.0, 1.0], "sensor 1 is inverted"),
+        (lambda sample, sensed: sensed[:, [1, 0, 2]], "swapped"),
+        (lambda sample, sensed: sensed * [1.0, 0.0, 1.0], "sensor 2 (is dead|repeats its values)"),
+        (lambda sample, sensed: sensed * [3.0, 3.0, 1.0], "have (2.9|3|3.1) times the gain"),
+        (lambda sample, sensed: sensed * [1.0, 1.0, -1.0], ""),
+    ],
+)
+def test_the_plate_of_a_hybrid_is_probed_and_its_screen_without_drive(spoil, named):
+    """Whatever the tribometer shows; a scene may leave the probe out."""
+    device = bench(spoil=spoil)
+    rendering = hr.prepare(scene(tone(250.0)), driver=device)
+    with device, pytest.raises(hr.DeviceFault, match=f"probe: .*({named})") if named else nullcontext():
+        rendering.probe(device)
+    drive = np.concatenate(device.played)
+    assert 0.01 < abs(drive[:, :2]).max() < 0.05 * 3.0
+    assert not drive[:, 2].any()
+    assert abs(drive[-1]).max() == 0.0
+    assert hr.prepare(replace(scene(tone(250.0)), rendering={"probe": False}), driver=bench()).probe is None
+
+
 def test_without_sensors_both_parts_are_driven_open_loop():
     """From the free device: a finger of 0.4 N takes a little of the plate's half, friction comes as designed."""
     device = bench(sensed_channels=0)
@@ -124,8 +148,8 @@ def test_a_fault_of_a_part_stops_the_whole_device_at_the_time_it_is_said_to():
     """Live: the plate, and its supervisor, play from 0.2 s on; a fault takes 7 ms to be seen, a fade 2 ms."""
 
     def failing(sample, sensed):
-        """The first sensor gives no numbers from 0.3 s on."""
-        return sensed * [np.nan if sample >= 0.3 * RATE else 1.0, 1.0, 1.0]
+        """The first sensor gives no numbers from 0.3 s on, after 0.3 s of the probe."""
+        return sensed * [np.nan if sample >= 0.6 * RATE else 1.0, 1.0, 1.0]
 
     driver = bench(spoil=failing)
     with hr.Player("hybrid", driver, paced=False) as player:

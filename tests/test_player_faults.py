@@ -55,6 +55,42 @@ def test_the_watchdog_stops_the_drive_of_an_application_that_hangs(tmp_path):
     assert np.all(hung.flags[first:] & hr.Flag.STOPPED)
 
 
+@pytest.mark.parametrize(
+    ("finger", "watchdog", "stopped"),
+    [((0.01, 0.05, 0.4), None, 0.6), ((0.01,), 0.3, 0.4), ((0.01,), np.inf, 0), ((np.nan,), None, 0), (None, None, 0)],
+)
+def test_an_application_that_hangs_while_a_finger_touches_is_stopped(finger, watchdog, stopped, monkeypatch):
+    """One that lets `sleep` wait is not, nor one that sets no finger or has lifted it, or has switched that off."""
+    assert hapticrender.player.TIMEOUT == 5.0
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
+    with hr.Player(paced=False, watchdog=watchdog) as player:
+        player.play(TONE)
+        if finger is not None:
+            player.finger(0.0)
+            player.finger(*finger)
+        player.sleep(0.1)
+        player._advance(0.7)
+        with pytest.raises(hr.WatchdogTimeout, match=f"stopped at {stopped}") if stopped else nullcontext():
+            player.sleep(0.7)
+
+
+def test_a_watchdog_that_nobody_has_set_runs_in_real_time(monkeypatch):
+    """It begins with the first word of a finger, ends as it lifts, and begins again; without one nothing stops."""
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
+    with hr.Player() as player:
+        player.play(TONE)
+        for _ in range(2):
+            time.sleep(0.8)
+            player.finger(0.0)
+            player.finger(np.nan)
+        player.finger(0.0)
+        end = time.monotonic() + 20.0
+        while player._error is None and time.monotonic() < end:
+            time.sleep(0.02)
+        with pytest.raises(hr.WatchdogTimeout, match=r"for 0\.5 s, the time of its watchdog"):
+            player.state()
+
+
 def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
     with hr.Player(watchdog=0.2) as player:
         player.play(TONE)

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from contextlib import nullcontext
 from dataclasses import replace
 
 import board
@@ -25,7 +26,7 @@ import hapticrender as hr
 from hapticrender.cli import main
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind, Reason, State
-from hapticrender.drivers.serial import BoardClient, Line
+from hapticrender.drivers.serial import BoardClient, Line, SerialDriver
 from hapticrender.errors import DeviceFault, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.plants.plate import PlateParameters
 
@@ -71,6 +72,51 @@ def test_a_scene_that_no_board_can_play_is_refused(stepped):
         hr.render(SCENE, driver=driver, method="h2")
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
         driver.play(np.zeros((1, 2)))
+
+
+class Swapped(SerialDriver):
+    """A board whose sensors are swapped."""
+
+    def signals(self, rows):
+        found = super().signals(rows)
+        return found | {"sensed": found["sensed"][:, ::-1]}
+
+
+@pytest.mark.parametrize(
+    ("gain", "kind", "named"),
+    [
+        ("1,1", SerialDriver, ""),
+        ("-1,1", SerialDriver, "sensor 1 is inverted"),
+        ("-1,-1", SerialDriver, "both sensors, or all actuators, are inverted"),
+        ("1,1", Swapped, "swapped"),
+        ("1,0", SerialDriver, "sensor 2 (is dead|repeats its values)"),
+        ("0,0", SerialDriver, "nothing moves"),
+        ("3,3", SerialDriver, "have (2.9|3|3.1) times the gain"),
+    ],
+)
+def test_a_board_is_probed_before_its_loop_closes(tmp_path, gain, kind, named):
+    """By the drive of the host: what is wired wrongly is refused and named, and the board's law has not begun."""
+    with SteppedBoard(tmp_path, "--noise", "1e-6", "--gain", gain, program=program_of("-O2")) as board:
+        driver = kind("stepped", background=False, clock=board, connect=board.connect, finger=FINGER)
+        refusal = pytest.raises(DeviceFault, match=f"refused by the start-up probe: .*({named})")
+        with refusal if named else nullcontext():
+            hr.render(replace(SCENE, duration=0.05), driver=driver)
+        board.sleep(0.02)  # its fade takes 10 ms
+        board.assert_at_rest()
+        states = [line[2] for line in board.board.log() if line[1] == "state"]
+    driving, at_rest, playing = (str(int(state)) for state in (State.DRIVING, State.IDLE, State.PLAYING))
+    assert states == (3 * [driving, at_rest] if named else [driving, at_rest, playing, at_rest])
+
+
+def test_a_probe_on_a_line_that_loses_samples_says_so(fast):
+    """One in ten pieces on their way from the board: no sensor is blamed, and a scene may leave the probe out."""
+    lost = np.random.default_rng(3)
+    read = fast.read
+    fast.read = lambda most: data if len(data := read(most)) < 200 or lost.random() > 0.1 else b""
+    with pytest.raises(DeviceFault, match=r"refused by the start-up probe: .*% of the samples were lost on the way"):
+        hr.render(SCENE, driver=fast.driver(finger=FINGER))
+    probed = replace(SCENE, duration=0.05, rendering={"probe": False})
+    assert len(hr.render(probed, driver=fast.driver(finger=FINGER))) == 250
 
 
 PRESSED = hr.Scene(
@@ -209,7 +255,7 @@ def test_a_run_goes_on_with_a_flag_after_its_board_was_lost(fast):
 
     def pull(seconds):
         wait(seconds)
-        if fast.time > 0.5 and not fast.pulled:
+        if fast.time > 0.9 and not fast.pulled:
             fast.pulled = fast.time + 0.7
 
     fast.sleep = pull

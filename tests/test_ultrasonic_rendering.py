@@ -1,5 +1,7 @@
 """Ultrasonic surfaces in closed loop: the amplitude on its resonance, and the friction that a scene asks for."""
 
+from contextlib import nullcontext
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -151,6 +153,44 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
 def watched(finger=SLIDE, **tell):
     """A resonant plate as a user's device, in blocks of 16: only the test gets its amplitude."""
     return Told(UltrasonicPlate(UltrasonicParameters(delay=16), finger, block=16), **tell)
+
+
+@pytest.mark.parametrize("load", [0.0, 0.4, 15.0])
+@pytest.mark.parametrize(
+    ("gain", "changes", "named"),
+    [
+        (1.0, {"temperature_rise": 20.0, "temperature_time": 1e-3}, ""),  # 60 Hz, of a half width of 75
+        (1.0, {"quality": 400.0}, ""),
+        (1.0, {"quality": 100.0}, ""),
+        (-1.0, {}, "sensor or actuator is inverted, or the delay"),
+        (0.0, {}, "sensor or actuator is dead"),
+        (np.nan, {}, "samples of the sensor are no numbers"),
+    ],
+)
+def test_a_vibrating_surface_is_probed_on_its_resonance(gain, changes, named, load):
+    """By a burst of 1 um at most, whatever the finger does."""
+    tell = lambda sample, sensed: sensed._replace(sensed=gain * sensed.sensed, motion=None)  # noqa: E731
+    device = Told(UltrasonicPlate(UltrasonicParameters(delay=16, **changes), held(load), block=16), tell)
+    device.probe = True
+    rendering = prepare(scene(frequency=200.0), driver=device)
+    with device, pytest.raises(hr.DeviceFault, match=f"probe: .*{named}") if named else nullcontext():
+        rendering.probe(device)
+    assert not np.concatenate(device.played[-16:]).any()
+    assert abs(np.concatenate(device.moved)).max() < 2e-6
+
+
+def test_a_gain_of_three_is_refused_on_a_free_surface_and_a_scene_may_leave_the_probe_out():
+    """A finger of 0.4 N damps by as much: there it is not distinguished."""
+    tell = lambda sample, sensed: sensed._replace(sensed=3.0 * sensed.sensed, motion=None)  # noqa: E731
+    for finger, refusal in (
+        (FREE, pytest.raises(hr.DeviceFault, match="the vibration is [23.]* times that of the free surface")),
+        (held(0.4), nullcontext()),
+    ):
+        device = watched(finger, tell=tell)
+        device.probe = True
+        with device, refusal:
+            prepare(scene(frequency=200.0), driver=device).probe(device)
+    assert prepare(replace(scene(frequency=200.0), rendering={"probe": False}), driver=device).probe is None
 
 
 def friction_of(moved, frequency, rate=192e3, load=0.4):

@@ -54,6 +54,7 @@ void board_begin(board_t *board, board_state state)
     board->state = state;
     board->cause = CAUSE_NONE;
     board->fade = state == BOARD_PLAYING ? REAL(1.0) : REAL(0.0);   /* the law fades in by itself */
+    board->flags_seen = 0;                        /* of the run before */
     board->fade_to = REAL(1.0);
     board->fade_step = REAL(1000.0) / ((real_t)BOARD_FADE_MS * board->played.rate);
     board->heat = REAL(0.0);

@@ -9,8 +9,9 @@ after it; its energy is none of the response's.
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import DiscretePlant
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import DeviceFault
-from hapticrender.protocols import Array, Driver
+from hapticrender.protocols import Array, Driver, Flag
 
 DURATION, EDGE, REST = 0.2, 0.03, 0.1  # s; Hann edges; silence after it
 TRIES = 3
@@ -59,20 +60,25 @@ class Found(NamedTuple):
     delay: int  # samples, of the loop; -1 where it was not looked for
 
 
-def probe_plate(driver: Driver, model: DeviceModel) -> None:
+def probe_plate(driver: Driver, model: Any) -> None:
     """Probe an open plate of two actuators and two sensors up to three times, and leave it at rest.
 
-    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`.  A
+    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`; a board,
+    whose loop is its own, by the drive of the host.  Of a hybrid the plate is probed, the screen without drive.  A
     `DeviceFault` where a deviation from the model was found in every try.
     """
-    model = replace(model, delay=model.delay + getattr(driver, "play_delay", driver.delay) - driver.delay)
+    places, model = len(model.places), getattr(model, "plate", model)
     drive = probe_drive(model)
-    found = []
     for _ in range(TRIES):
-        found.append(judge(model, drive, _play(driver, drive, len(model.places))))
-        if not found[-1].fault:
+        with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
+            delay = model.delay + getattr(player, "play_delay", player.delay) - player.delay
+            played = replace(model, delay=delay, block=player.block)
+            sensed, lost = _play(player, drive, places)
+        last = judge(played, drive, sensed)
+        if not last.fault:
             return
-    last = found[-1]
+        if lost > MOST_INVALID:
+            last = Found(f"{lost:.0%} of the samples were lost on the way: the probe cannot judge", np.nan, np.nan, -1)
     shares = ((name, getattr(last, name)) for name in ("residual", "scale"))
     figures = [f"{name} {value:.2g}" for name, value in shares if np.isfinite(value)]
     figures += [f"delay {last.delay} samples"] * (last.delay >= 0)
@@ -168,14 +174,14 @@ def _detrended(values: Array) -> Array:
     return np.asarray(values - basis @ (basis.T @ values))
 
 
-def _play(driver: Driver, drive: Array, places: int) -> Array:
-    """Play a drive and silence after it in blocks; what was sensed meanwhile."""
+def _play(driver: Driver, drive: Array, places: int) -> tuple[Array, float]:
+    """Play a drive and silence after it in blocks; what was sensed meanwhile, and the share that was lost."""
     silence = round(REST * driver.rate)
     blocks = -(-(len(drive) + silence) // driver.block)
-    padded = np.zeros((blocks * driver.block, drive.shape[1]))
-    padded[: len(drive)] = drive
+    padded = np.zeros((blocks * driver.block, driver.drive_channels))
+    padded[: len(drive), : drive.shape[1]] = drive
     parts = [
-        check_sensed(driver, driver.play(block.copy()), places).sensed
-        for block in padded.reshape(blocks, driver.block, -1)
+        check_sensed(driver, driver.play(block.copy()), places) for block in padded.reshape(blocks, driver.block, -1)
     ]
-    return np.concatenate(parts)
+    lost = [0.0 if part.flags is None else float(np.mean(part.flags & Flag.OVERRUN > 0)) for part in parts]
+    return np.concatenate([part.sensed[:, : len(ONE)] for part in parts]), sum(lost) / blocks

@@ -66,34 +66,37 @@ def refuse_to_overwrite(texture: Texture, path: Any) -> None:
         raise ValueError(f"{path}: would overwrite the scene's texture: choose another name")
 
 
+class InseparableTexture(ValueError):
+    """A texture that is no sum of functions of time and of position."""
+
+
 class SeparatedTexture:
     """A texture, parted into functions of time (`timed`: any part) and of position (`spatial`).
 
     It is in time, along the surface (see `is_spatial`), or a `Sum` of both; `waveform_of` a part is its
-    waveform in the device's quantity, by default its own.  A ValueError where its parts are in time and along the
-    surface, and it is no sum; or a function of position is not the same at all `READINGS`, or one of time
-    not at all `PLACES`.
+    waveform in the device's quantity, by default its own.  An `InseparableTexture` where its parts are in time and
+    along the surface, and it is no sum; or a function of position is not the same at all `READINGS`, or one of time not
+    at all `PLACES`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
-        terms, name = _terms(texture), type(texture).__name__
+        terms, name, here = _terms(texture), type(texture).__name__, " on a sound card or a board"
         for each, _ in terms:
             kinds = {is_spatial(part) for part, _ in getattr(each, "parts", ())}
             if kinds == {True, False} or (True in kinds and not isinstance(each, Sum)):
                 problem = f"{type(each).__name__} with a part along the surface"
-                raise ValueError(f"{problem}: play its parts one after another")
+                raise InseparableTexture(f"{problem}: play its parts one after another")
         self._terms = [
             (each, is_spatial(each), waveform_of(each) if waveform_of else each.waveform, gain) for each, gain in terms
         ]
         self.timed, self.spatial = (any(along == kind for _, along, _, _ in self._terms) for kind in (False, True))
         if self.spatial and self._varies(True, READINGS, 0):
-            raise ValueError(f"{name}: must not change with time: it is a function of position")
+            raise InseparableTexture(f"{name}: must not change with time{here}: it is a function of position")
         if self.timed and (
             self._varies(False, SOON, 1) or (self.in_time(SOON) != self._sum(False, SOON, 0.0 * SOON)).any()
         ):
-            raise ValueError(
-                f"{name}: must not change with the finger's position or contact, or a reading: it is a function of time"
-            )
+            kept = f"the finger's position or contact{here}, or a reading"
+            raise InseparableTexture(f"{name}: must not change with {kept}: it is a function of time")
 
     def _varies(self, spatial: bool, times: Array, axis: int) -> bool:
         """Whether a part changes over `times` (axis 0, s), or over `PLACES` (axis 1)."""

@@ -106,7 +106,7 @@ class DeviceProfile(Validated):
     measured_by: str = checked(checks.text, "", about="who measured it")
     measured_with: str = checked(checks.text, "", about="with what")
     measured_on: date | None = checked(_day, None, about='when, also as a text "2026-11-22"')
-    probe: bool = checked(checks.flag, True, about="whether a plate is probed before the loop closes")
+    probe: bool = checked(checks.flag, True, about="whether the device is probed before the loop closes")
     device: Mapping[str, Any] = mapping(_parameters, "parameters (number, str or bool), as in a scene's ``[device]``")
     uncertainty: Mapping[str, float] = mapping(_uncertainty, "standard uncertainty of parameters, in their units")
     calibration: Calibration = checked(_part, Calibration(), about="also as a table", kind=Calibration)
