@@ -73,7 +73,8 @@ class WatchdogTimeout(HapticError):
     def __str__(self) -> str:
         time, watchdog = self.args
         allowed = "the time of its watchdog" if watchdog is None else f"{watchdog:.3g} s, the time of its watchdog"
-        return f"stopped at {time:.4g} s: no method of the player was called for {allowed}"
+        cure = "set the finger again while it rests, or give Player another watchdog (math.inf: none)"
+        return f"stopped at {time:.4g} s: no method of the player was called for {allowed}: {cure}"
 
 
 class PlateMismatch(UserWarning):
