@@ -73,8 +73,8 @@ def probe_plate(driver: Driver, model: Any) -> None:
         with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
             delay = model.delay + getattr(player, "play_delay", player.delay) - player.delay
             played = replace(model, delay=delay, block=player.block)
-            sensed, lost = _play(player, drive, places)
-        last = judge(played, drive, sensed)
+            sensed, lost = play_probe(player, drive, places, REST)
+        last = judge(played, drive, sensed[:, : len(ONE)])
         if not last.fault:
             return
         if lost > MOST_INVALID:
@@ -174,14 +174,13 @@ def _detrended(values: Array) -> Array:
     return np.asarray(values - basis @ (basis.T @ values))
 
 
-def _play(driver: Driver, drive: Array, places: int) -> tuple[Array, float]:
-    """Play a drive and silence after it in blocks; what was sensed meanwhile, and the share that was lost."""
-    silence = round(REST * driver.rate)
-    blocks = -(-(len(drive) + silence) // driver.block)
+def play_probe(driver: Driver, drive: Array, places: int, rest: float) -> tuple[Array, float]:
+    """Play a drive (n, channels) and `rest` s of silence in blocks; what was sensed meanwhile, and the share lost."""
+    blocks = -(-(len(drive) + round(rest * driver.rate)) // driver.block)
     padded = np.zeros((blocks * driver.block, driver.drive_channels))
     padded[: len(drive), : drive.shape[1]] = drive
     parts = [
         check_sensed(driver, driver.play(block.copy()), places) for block in padded.reshape(blocks, driver.block, -1)
     ]
     lost = [0.0 if part.flags is None else float(np.mean(part.flags & Flag.OVERRUN > 0)) for part in parts]
-    return np.concatenate([part.sensed[:, : len(ONE)] for part in parts]), sum(lost) / blocks
+    return np.concatenate([part.sensed for part in parts]), sum(lost) / blocks

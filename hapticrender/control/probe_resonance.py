@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.driver_checks import check_sensed
+from hapticrender.control.probe import TRIES, play_probe
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Driver
 
 DURATION, EDGE, JUDGED, REST = 25e-3, 5e-3, 10e-3, 15e-3  # s; judged at the end; silence after it
 SHARE = 0.05  # of the drive's limit
-TRIES = 3
 LEAST, MOST_GAIN = 0.4, 0.6  # least r: a quality 2.5 times that stated; r of the most damped surface over its gain
 MOST_LOAD = 20.0  # N
 
@@ -33,7 +32,8 @@ def probe_resonance(driver: Driver, mode: Any) -> None:
     mode, fault = mode.sampled(driver.rate), ""
     drive = resonance_drive(mode)
     for _ in range(TRIES):
-        fault = judge_resonance(mode, driver.delay - driver.block, drive, _play(driver, drive))
+        sensed = play_probe(driver, drive[:, None], 1, REST)[0][: len(drive), 0]
+        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed)
         if not fault:
             return
     cure = "check the wiring, or [device]; [render] probe = false leaves the probe out"
@@ -67,12 +67,3 @@ def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> str:
     if damping < LEAST:
         return f"the vibration is {1 / damping:.2g} times that of the free surface: gain or quality is not that stated"
     return ""
-
-
-def _play(driver: Driver, drive: Array) -> Array:
-    """Play a drive and silence after it in blocks; what was sensed during the drive."""
-    blocks = -(-(len(drive) + round(REST * driver.rate)) // driver.block)
-    padded = np.zeros((blocks * driver.block, 1))
-    padded[: len(drive), 0] = drive
-    parts = [check_sensed(driver, driver.play(block.copy()), 1).sensed for block in padded.reshape(blocks, -1, 1)]
-    return np.concatenate(parts)[: len(drive), 0]
