@@ -100,6 +100,8 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
         raise ProtocolError(f"{where} is no array of {'whole ' * (kind is np.int64)}numbers: {error}") from None
     if given.shape != shape:
         raise ProtocolError(f"{where} has shape {given.shape}, must be {shape}")
+    if name == "position" and np.isinf(column).any():
+        raise ProtocolError(f"{where} is infinite: must be m from the middle, NaN while lifted")
     if kind is np.int64 and (unknown := int(np.bitwise_or.reduce(column)) & ~FLAGS):
         raise ProtocolError(f"{where} has bits {unknown}, must be of hapticrender.Flag, 0 to {FLAGS}")
     return column

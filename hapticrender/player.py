@@ -29,7 +29,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hapticrender.checks import number
+from hapticrender.checks import flag, number
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
@@ -102,8 +102,9 @@ class Player(Addressed):
         watchdog: float | None = None,
         **tables: Any,
     ) -> None:
-        if watchdog not in (None, math.inf) and not 2.0 * SERVICE <= watchdog <= LONGEST_WATCHDOG:
-            raise ValueError(f"{watchdog=} s: must be {2.0 * SERVICE:g} to {LONGEST_WATCHDOG:g} s, or inf: never")
+        if watchdog not in (None, math.inf):
+            watchdog = number("watchdog", watchdog, "s", least=2.0 * SERVICE, most=LONGEST_WATCHDOG)
+        flag("paced", paced)
         if "texture" in tables:
             raise TypeError("texture: a player has none of its own: call play(texture)")
         if tables.get("touch_panel"):
@@ -225,7 +226,7 @@ class Player(Addressed):
         """
         self._check()
         now, sane = time.monotonic() if self._paced else self.time, False
-        with suppress(TypeError):
+        with suppress(TypeError, ValueError):
             if velocity is None:
                 moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
                 velocity = moved / passed if 0.0 < passed < UPDATES and abs(moved) <= FASTEST * passed else 0.0

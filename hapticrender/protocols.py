@@ -47,7 +47,7 @@ class Sensed(NamedTuple):
 
     sensed: Array  # (n, sensed_channels), in the sensors' unit (m on a plate)
     position: Array | None = None  # (n,), m from the middle of the surface, NaN while no finger touches
-    motion: Array | None = None  # (n, places), m: the true motion at the evaluation points, of simulated devices only
+    motion: Array | None = None  # (n, places): true motion at the evaluation points (model.places), where it is known
     normal_load: Array | None = None  # (n,), N
     flags: Array | None = None  # (n,), `Flag` bits raised by the device
 

@@ -122,6 +122,7 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
         ),
         ({"flags": np.full(4, -1)}, "flags has bits -256, must be of hapticrender.Flag"),
         ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
+        ({"position": np.array([0.0, np.nan, np.inf, 0.0])}, "position is infinite: must be m from the middle"),
     ],
 )
 def test_a_column_that_would_lose_something_is_refused(columns, message):

@@ -341,6 +341,17 @@ def test_a_run_is_judged_to_its_end(rng, left, last, found):
     assert summary["waveform"]["lost_windows"] == (1 if math.isnan(last) else 0)
 
 
+@pytest.mark.parametrize("silent", [1.0, 2.4, 3.9], ids=["start", "middle", "end"])
+def test_a_tenth_of_a_second_of_silence_counts_wherever_it_is(silent):
+    """0.1 s of 4 s: sqrt(0.1/4) = 16 %; spectra count a sample 2/3 to 3/2 times, by where it is in two Hann windows."""
+    time = times(4.0)
+    tone = 50e-6 * np.cos(2 * np.pi * 120.0 * time)
+    motion = np.where((time >= silent) & (time < silent + 0.1), 0.0, tone)
+    figures, verdict = judged(tone, motion, tolerance=0.15)
+    assert 0.99 < figures["waveform_error"] / math.sqrt(0.1 / 4.0) < math.sqrt(3 / 2)
+    assert verdict == "failed"
+
+
 def test_the_sample_that_ends_a_run_which_was_cut_off_is_not_judged():
     bands = make_bands(100.0, 10 * UM)
     recorder = make_recorder(None, bands)

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import soundfile
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.errors import SceneError
 from hapticrender.touch import toml
@@ -277,3 +279,13 @@ def test_no_nearly_good_scene_is_a_traceback(texture, finger):
 @example('a = "\\uD800"')
 def test_no_random_text_is_a_traceback(text):
     accept_or_refuse(text)
+
+
+def test_what_cannot_be_felt_is_played_unless_it_is_left_out():
+    """3 um at 21 Hz cannot be felt, and are most of this texture: left out, they are its error."""
+    texture = hr.Grating(frequency=21.0, amplitude=3e-6) + hr.Grating(frequency=120.0, amplitude=2e-6)
+    scene = hr.Scene(texture=texture, duration=1.5, settle=0.5)
+    assert hr.render(scene).summary()["passed"]
+    less = hr.render(replace(scene, keep_unfelt=False)).summary()
+    missing = 3.0 / np.hypot(3.0, 2.0)
+    assert (less["verdict"], less["worst"]["value"]) == ("failed", pytest.approx(missing, rel=0.02))

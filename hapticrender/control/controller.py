@@ -180,8 +180,9 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
 def refuse_whole_waveform(bands: Bands, who: str = "this method", recordings: str = "recordings") -> None:
     """Refuse a texture without carriers, in a method that works band by band."""
     if bands.envelope is None and not len(bands):
-        played = f"{who} plays bands, not the whole waveform: gratings, and {recordings} with carriers"
-        raise ValueError(f"texture.carriers is missing: must be >= 1, {played}")
+        raise ValueError(
+            f"texture: {who} plays bands, no whole waveform: gratings, and {recordings} with carriers >= 1"
+        )
 
 
 def shared_settings(

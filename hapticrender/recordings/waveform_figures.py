@@ -2,8 +2,8 @@
 
 Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
 rms_b over a third octave b with both edges in B (on a plate also above, see `_thirds`); S_b detection threshold (rms)
-in it.  Over the whole play both come from spectra, E = rms_B(e)/rms_B(r) among them; windows of 100 ms and contacts
-from signals filtered without phase.
+in it.  Over the whole play both come from spectra, windows of 100 ms and contacts from signals filtered without phase;
+E = rms_B(e)/rms_B(r) is the larger one by both: spectra hardly see the ends, the filter blurs the edges of B.
 """
 
 from __future__ import annotations
@@ -79,12 +79,15 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     if found["share_in_band"] < LEAST:
         return found
     total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
+    weights = np.append(np.ones(count), [(stop - whole) / window] * (whole < stop))  # of the last one what is new
     shares, scales = _scales(header)
     noise = _noise(recording, *_band(rate)) / scales / math.sqrt(reference[inside].sum())
     found["sensor_noise"] = float(noise.max())
     for i, place in enumerate(places, start=1):
         columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
-        errors = {"waveform_error": math.sqrt(total[i] / total[0]), "window_error": _windows(power[:, [0, i]])}
+        alike = float(weights @ power[:, i] / (weights @ power[:, 0]))
+        whole_error = math.sqrt(max(alike, total[i] / total[0]))
+        errors = {"waveform_error": whole_error, "window_error": _windows(power[:, [0, i]])}
         thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, rms, i - 1), share)
         found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))

@@ -132,7 +132,8 @@ class Scene(Validated):
     settle : float, s
         Left out of the judgement at the beginning, >= 0; of a scene shorter than twice this the last half is judged.
     keep_unfelt : bool
-        Whether bands below the safe detection threshold are rendered all the same; default: they are left out.
+        Whether bands below the safe detection threshold are rendered all the same, as by default; left out, they are
+        still part of what the verdict compares with.
     gradient : float, 1/m
         Growth of the target amplitude along the surface, as a share of itself, from its middle on; -1000 to 1000.
         Only on a plate with two coils.
@@ -163,7 +164,7 @@ class Scene(Validated):
     method: str = checked(checks.name, defaults.METHOD)
     tolerance: float = parameter(0.1, "(a share: 0.05 is 5 %)", above=0, most=1)
     settle: float = parameter(1.0, "s", most=LONGEST_TIME)
-    keep_unfelt: bool = checked(checks.flag, False)
+    keep_unfelt: bool = checked(checks.flag, True)
     gradient: float = parameter(0.0, "1/m", least=-1e3, most=1e3)
     seed: int = parameter(0)
     name: str = checked(checks.name, "scene")
