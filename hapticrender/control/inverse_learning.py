@@ -26,6 +26,7 @@ from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.mathx import TURN
 
 FARTHEST_LEVER = 2.0  # no surface is longer
+UNREPORTED = 20e3  # N/m: what a finger that is not reported yet may add to each parameter of heave and rocking
 
 
 @kernel
@@ -178,19 +179,26 @@ def restart(inverse):
 
 
 @kernel
-def suspect_lift(inverse):
-    """Learn at once whether the finger is still there: all of its estimate becomes uncertain alike.
+def suspect_contact(inverse):
+    """Learn at once from a deviation that no report explains: a touch or a lift is reported late.
 
-    A lift is reported late.
+    All of a finger's estimate becomes uncertain alike.  On the untouched device heave and rocking stand for a finger,
+    wherever it is, until the report sets them back (`restore_device`).
     """
     v = record(inverse, INVERSE_T, 0)
     theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
             covariance[i, j] = covariance[j, i] = v.prior_covariance[i, j]
-    for i in range(FINGER, HEAVE):
-        for j in range(FINGER, HEAVE):
-            covariance[i, j] += theta[i] * theta[j]
+    if v.contact > 0.0:
+        for i in range(FINGER, HEAVE):
+            for j in range(FINGER, HEAVE):
+                covariance[i, j] += theta[i] * theta[j]
+    else:
+        for i in range(3):
+            covariance[HEAVE + i, HEAVE + i] += UNREPORTED * UNREPORTED
+            covariance[COUPLING + i, COUPLING + i] += UNREPORTED * UNREPORTED
+        covariance[LOAD + 1, LOAD + 1] = v.prior_covariance[LOAD, LOAD]  # the load may act anywhere
     restart_regressors(inverse)
     v.since = v.relearning_delay
 
