@@ -195,7 +195,7 @@ def test_a_coordinate_with_a_design_of_its_own_may_have_more_taps_than_the_notch
     assert whole.taps.shape[1] < own.taps.shape[1] == 8
     np.testing.assert_array_equal(own.taps[HEAVE, : whole.taps.shape[1]], whole.taps[HEAVE])
     assert not own.taps[HEAVE, whole.taps.shape[1] :].any()
-    quality = float(own.note.rpartition("; coordinate 2 Q ")[2])
+    quality = float(own.note.rpartition("; coordinate 2 on: Q ")[2].split()[0])
     np.testing.assert_array_equal(own.taps[ROCKING], damping_taps(oscillators(model), quality, plain=8)[ROCKING])
 
 

@@ -26,7 +26,7 @@ LEAST_RATIO = 1e-4  # damping ratio that margins assume at least, so that an ide
 QUALITY, QUALITY_UNMEASURED = 1.4, 2.0  # the least Q, with the bending mode known and while it is not
 QUALITY_STEP = 0.1
 WORTH = 3.5  # the damper is off where it cannot add so many times the mode's own damping
-REACHES = (0.6, 0.7, 0.8, 0.9, 1.0, 1.2)  # of a bending period: how long notched taps may reach back
+REACHES = (0.6, 0.7, 0.8, 0.9, 1.0)  # of a bending period: how long notched taps may reach back
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ def choose_damping(
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
     measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
     measured or the model is rigid, else at 2.  Where even a damper of 3.5 times the modes' own damping would not do,
-    the damper is off.  Notched taps reach back 0.6 to 1.2 bending periods; the reach with the least noise is taken.
+    the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
 
     `apart`: every coordinate has a damper of its own, or none, each from Q 1.4 on; rocking, which a symmetric bending
     mode does not couple into, needs no notch.
