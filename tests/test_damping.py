@@ -205,7 +205,7 @@ def test_a_slow_or_late_loop_raises_the_quality_or_switches_off():
     off = choose_damping(model_of(500))
     assert off.text() == f"inner damper {off.note}"
     assert off.note == (
-        "off: with a delay of 1 sample at 500 Hz, modulus margin 0.31 at 145.6 Hz is below 0.59 even at Q 5.5"
+        "off: with a delay of 1 sample at 500 Hz, modulus margin 0.40 at 146.5 Hz is below 0.59 even at Q 6.3"
     )
     assert off.margins == ()
     assert off.quality == math.inf
