@@ -41,8 +41,8 @@ class NaiveInverse:
         self.references.append(waveform * (3 * self.fade**2 - 2 * self.fade**3) * self.smooth)
         now = self.reference(n - law["delay"] - 6)
         dev = y - self.alpha * now
-        if self.gate(dev[0]) and self.since > law["initial_end"] and self.contact:
-            self.suspect_lift()
+        if self.gate(dev[0]) and self.since > law["initial_end"]:
+            self.suspect_change()
         self.past = np.column_stack([dev, self.past[:, :-1]])
         if settled:
             for i in range(self.n):
@@ -71,18 +71,20 @@ class NaiveInverse:
         if touching:
             self.lever = np.clip(law["lever_per_metre"] * position, -2.0, 2.0)
         self.since += 1
+        suspected = self.away < 0
         self.away = 0 if touching else self.away + 1
-        touching = touching or int(self.contact and self.away < law["loss_time"])
+        if suspected and touching:
+            self.since, self.timer = 0, law["damper_time"]
+            self.restore_device()
+        touching = touching or int(self.contact and self.away < (0 if suspected else law["loss_time"]))
         if touching != self.contact:
             self.contact, self.since, self.timer = touching, 0, law["damper_time"]
             self.reset(FINGER, HEAVE)
             self.reset(LOAD, COUNT)
             self.discretise()
         elif self.since in (law["learning_delay"], law["relearning_delay"]):
-            self.theta[HEAVE:LOAD] = self.earlier[0][0]
             self.P[:] = law["prior_covariance"]
-            self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0][1]
-            self.earlier = self.earlier[0], self.earlier[0]
+            self.restore_device()
             self.restart_regressors()
         elif self.since == law["initial_end"]:
             self.reset(INITIAL, COUNT)
@@ -90,18 +92,28 @@ class NaiveInverse:
             self.earlier = self.earlier[1], (self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy())
         return self.since >= law["learning_delay"]
 
+    def restore_device(self):
+        self.reset(HEAVE, LOAD)
+        self.theta[HEAVE:LOAD], self.P[HEAVE:LOAD, HEAVE:LOAD] = self.earlier[0]
+        self.earlier = self.earlier[0], self.earlier[0]
+
     def restart_regressors(self):
         self.psi[:] = 0.0
         self.psi[:, INITIAL:COUNT] = np.eye(4)
         self.theta[INITIAL:] = 0.0
         self.P[INITIAL:, INITIAL:] = np.diag(self.law["initial_variance"])
 
-    def suspect_lift(self):
-        self.P[LOAD:] = self.law["prior_covariance"][LOAD:]
-        self.P[:, LOAD:] = self.law["prior_covariance"][:, LOAD:]
-        self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
+    def suspect_change(self):
+        law, prior = self.law, self.law["prior_covariance"]
+        self.P[LOAD:], self.P[:, LOAD:] = prior[LOAD:], prior[:, LOAD:]
+        if self.contact:
+            self.since = law["relearning_delay"]
+            self.P[:HEAVE, :HEAVE] += np.outer(self.theta[:HEAVE], self.theta[:HEAVE])
+        else:
+            self.contact, self.lever, self.away, self.since = 1, 0.0, -law["report_delay"], law["learning_delay"]
+            self.P[COUPLING:LOAD, COUPLING:LOAD] += 15e3**2 * np.eye(3)
+            self.P[LOAD + 1, LOAD + 1] = prior[LOAD, LOAD]
         self.restart_regressors()
-        self.since = self.law["relearning_delay"]
 
     def reset(self, first, last):
         inside = slice(first, last)

@@ -119,7 +119,7 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
         (-np.eye(2), np.eye(2), None, causes.SENSOR_GAIN, "sensor 1 and 2"),
         (np.eye(2), -np.eye(2), None, causes.ACTUATOR_GAIN, "actuator 1 and 2"),
         (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), causes.SWAPPED, "sensor 1 and 2"),
-        (np.eye(2), np.eye(2)[::-1], (0.3, -0.05), causes.SWAPPED, "sensor 1 and 2"),
+        (np.eye(2), np.eye(2)[::-1], (0.8, -0.05), causes.SWAPPED, "sensor 1 and 2"),
     ],
     ids=["sensors inverted", "coils inverted", "sensors swapped", "coils swapped"],
 )

@@ -197,8 +197,8 @@ static void use_sensors(law_t *law, const real_t coordinates[2], uint32_t learns
     const design_t *d = law->design;
     const real_t error[2] = {
         coordinates[0] - d->pattern[0] * law->reference, coordinates[1] - d->pattern[1] * law->reference};
-    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->initial_end) && (law->learning.contact != 0u)) {
-        learning_suspect_lift(law);
+    if ((open_gate(law, error[0]) != 0u) && (law->learning.since > d->initial_end)) {
+        learning_suspect_change(law);
     }
     if (learns != 0u) {
         learning_update(law, error);

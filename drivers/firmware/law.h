@@ -114,7 +114,8 @@ typedef struct {
     real_t earlier[2][LAW_OWN + 1][LAW_OWN]; /* the device's own covariance and parameters, 10-20 ms and 0-10 ms ago */
     real_t model_power[2];
     real_t lever;
-    uint32_t contact, since, away; /* 0 or 1; samples */
+    uint32_t contact, since; /* 0 or 1; samples */
+    int32_t away;            /* samples without a position; below 0 until that of a suspected touch is due */
 } learning_t;
 
 /* The whole state; only law_* functions touch it. */

@@ -27,7 +27,7 @@ void learning_init(law_t *law);
 void learning_reset(law_t *law, uint32_t first, uint32_t last);
 void learning_reset_all(law_t *law);
 uint32_t learning_follow_contact(law_t *law);
-void learning_suspect_lift(law_t *law);
+void learning_suspect_change(law_t *law);
 void learning_update(law_t *law, const real_t error[2]);
 void learning_revert(law_t *law);
 void learning_discretise(law_t *law);

@@ -4,6 +4,7 @@
 #include <string.h>
 
 #define FARTHEST_LEVER REAL(2.0) /* no surface is longer */
+#define UNREPORTED REAL(15e3)    /* N/m, of the coupling, for a finger whose place is not known yet: 12 N s/m or 10 g */
 #define LONG_AGO 1000000000u     /* samples since the contact of a law at rest */
 #ifdef REAL_DOUBLE
 #define TERMS 10u                /* of the series of the exponential, whose rest is below a rounding: 0.5^11/11! */
@@ -191,39 +192,62 @@ static void restart_regressors(law_t *law)
     }
 }
 
-/*
- * Learn afresh, with the deviation of now as four more parameters.  The estimates stay, but the device's own go back to
- * the earlier note, as a contact is reported after it happened; the covariance of all others returns to the prior.
- */
-static void restart(law_t *law)
+/* Set the device's own parameters back to the earlier note: a contact is reported after it happened. */
+static void restore_device(law_t *law)
 {
     learning_t *v = &law->learning;
-    (void)memcpy(v->covariance, law->design->prior_covariance, sizeof(v->covariance));
+    learning_reset(law, LAW_HEAVE, LAW_LOAD);
     (void)memcpy(v->earlier[1], v->earlier[0], sizeof(v->earlier[1]));
     for (uint32_t i = 0u; i < LAW_OWN; i++) {
         v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
         (void)memcpy(&v->covariance[LAW_HEAVE + i][LAW_HEAVE], v->earlier[0][i], sizeof(v->earlier[0][i]));
     }
+}
+
+/*
+ * Learn afresh, with the deviation of now as four more parameters.  The estimates stay, but for the device's own; the
+ * covariance of all others returns to the prior.
+ */
+static void restart(law_t *law)
+{
+    learning_t *v = &law->learning;
+    (void)memcpy(v->covariance, law->design->prior_covariance, sizeof(v->covariance));
+    restore_device(law);
     restart_regressors(law);
 }
 
-/* Learn at once whether the finger is still there: all of its estimate becomes uncertain alike; a lift is reported late. */
-void learning_suspect_lift(law_t *law)
+/*
+ * Learn at once from a deviation that no report explains: a touch and a lift are reported late.  An untouched device
+ * counts as touched in the middle, until the report is due; of a finger that may have left all is uncertain alike.
+ */
+void learning_suspect_change(law_t *law)
 {
     learning_t *v = &law->learning;
+    const design_t *d = law->design;
     for (uint32_t i = LAW_LOAD; i < LAW_PARAMETERS; i++) {
         for (uint32_t j = 0u; j < LAW_PARAMETERS; j++) {
-            v->covariance[i][j] = law->design->prior_covariance[i][j];
-            v->covariance[j][i] = law->design->prior_covariance[i][j];
+            v->covariance[i][j] = d->prior_covariance[i][j];
+            v->covariance[j][i] = d->prior_covariance[i][j];
         }
     }
-    for (uint32_t i = LAW_FINGER; i < LAW_HEAVE; i++) {
-        for (uint32_t j = LAW_FINGER; j < LAW_HEAVE; j++) {
-            v->covariance[i][j] += v->theta[i] * v->theta[j];
+    if (v->contact != 0u) {
+        v->since = d->relearning_delay;
+        for (uint32_t i = LAW_FINGER; i < LAW_HEAVE; i++) {
+            for (uint32_t j = LAW_FINGER; j < LAW_HEAVE; j++) {
+                v->covariance[i][j] += v->theta[i] * v->theta[j];
+            }
         }
+    } else {
+        v->contact = 1u;
+        v->lever = REAL(0.0);
+        v->away = -(int32_t)d->report_delay;
+        v->since = d->learning_delay;
+        for (uint32_t i = LAW_COUPLING; i < LAW_LOAD; i++) {
+            v->covariance[i][i] += UNREPORTED * UNREPORTED;
+        }
+        v->covariance[LAW_LOAD + 1][LAW_LOAD + 1] = d->prior_covariance[LAW_LOAD][LAW_LOAD];
     }
     restart_regressors(law);
-    v->since = law->design->relearning_delay;
 }
 
 /* Reset what belongs to a contact when one begins or ends, and learn afresh; 1 where there is something to learn. */
@@ -236,8 +260,15 @@ uint32_t learning_follow_contact(law_t *law)
         v->lever = real_clip(d->lever_per_metre * law->finger.position, -FARTHEST_LEVER, FARTHEST_LEVER);
     }
     v->since += (v->since < UINT32_MAX) ? 1u : 0u;
-    v->away = (touching != 0u) ? 0u : (v->away + ((v->away < UINT32_MAX) ? 1u : 0u));
-    if ((v->contact != 0u) && (v->away < d->loss_time)) { /* a position that is missing for so short is no lift-off */
+    const uint32_t suspected = (v->away < 0) ? 1u : 0u;
+    v->away = (touching != 0u) ? 0 : (v->away + ((v->away < INT32_MAX) ? 1 : 0));
+    if ((suspected != 0u) && (touching != 0u)) { /* what was learned of the finger stays */
+        v->since = 0u;
+        law->fast_timer = d->damper_time;
+        restore_device(law);
+    }
+    const int32_t most = (suspected != 0u) ? 0 : (int32_t)d->loss_time;
+    if ((v->contact != 0u) && (v->away < most)) { /* a position that is missing for so short is no lift-off */
         touching = 1u;
     }
     if (touching != v->contact) {

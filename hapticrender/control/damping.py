@@ -25,7 +25,7 @@ TAPS, REACH = 3, 0.4e-3  # at least; s: more reach as far back as three at 5 kHz
 LEAST_RATIO = 1e-4  # damping ratio that margins assume at least, so that an ideal mode has a finite peak
 QUALITY, QUALITY_UNMEASURED = 1.4, 2.0  # the least Q, with the bending mode known and while it is not
 QUALITY_STEP = 0.1
-WORTH = 4.0  # the damper is off where it cannot add so many times the mode's own damping
+WORTH = 3.5  # the damper is off where it cannot add so many times the mode's own damping
 REACHES = (0.6, 0.7, 0.8, 0.9, 1.0)  # of a bending period: how long notched taps may reach back
 
 
@@ -66,9 +66,10 @@ class Damping:
 
     def text(self) -> str:
         """Return the note and a line of margins for each coordinate."""
+        damped = [i for i, taps in enumerate(self.taps, start=1) if taps.any()]
         lines = [
             f"  coordinate {i}: {margins}, noise {noise:.2f} um per um of sensor noise"
-            for i, (margins, noise) in enumerate(zip(self.margins, self.noise, strict=True), start=1)
+            for i, margins, noise in zip(damped, self.margins, self.noise, strict=True)
         ]
         return "\n".join([f"inner damper {self.note}", *lines])
 
@@ -194,36 +195,33 @@ def choose_damping(
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
     measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
-    measured or the model is rigid, else at 2.  Where even a damper of four times the modes' own damping would not do,
+    measured or the model is rigid, else at 2.  Where even a damper of 3.5 times the modes' own damping would not do,
     the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
 
-    `apart`: every coordinate has a Q of its own, so that rocking, which a symmetric bending mode does not couple into,
-    is damped from Q 1.4 on and without a notch.
+    `apart`: every coordinate has a damper of its own, or none, each from Q 1.4 on; rocking, which a symmetric bending
+    mode does not couple into, needs no notch.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
     known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
     plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
-    whole = _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, plain)
-    if bending is None or not apart or not whole.margins:
-        return whole
-    for i, part in enumerate(parts):
-        if bending.coupling[i] == 0.0:
-            whole = _replaced(whole, i, _chosen((part,), QUALITY, None, plain))
-    return whole
+    if not apart:
+        return _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, plain)
+    modes = [replace(bending, coupling=(each,)) if each else None for each in bending.coupling] if bending else None
+    return _joined([_chosen((part,), QUALITY, modes[i] if modes else None, plain) for i, part in enumerate(parts)])
 
 
-def _replaced(whole: Damping, i: int, own: Damping) -> Damping:
-    """Damper with the taps of coordinate i from a design of its own, where that has any."""
-    if not own.margins:
-        return whole
-    count = max(whole.taps.shape[1], own.taps.shape[1])
-    taps, added = np.pad(whole.taps, ((0, 0), (0, count - whole.taps.shape[1]))), whole.added_damping.copy()
-    taps[i], added[i] = np.pad(own.taps[0], (0, count - own.taps.shape[1])), own.added_damping[0]
-    margins, noise = list(whole.margins), list(whole.noise)
-    margins[i], noise[i] = own.margins[0], own.noise[0]
-    note = f"{whole.note}; coordinate {i + 1} Q {own.quality:g}"
-    return replace(whole, taps=taps, added_damping=added, margins=tuple(margins), noise=tuple(noise), note=note)
+def _joined(dampers: list[Damping]) -> Damping:
+    """Join the dampers of single coordinates, of which some may be off."""
+    count = max(each.taps.shape[1] for each in dampers)
+    return Damping(
+        taps=np.vstack([np.pad(each.taps, ((0, 0), (0, count - each.taps.shape[1]))) for each in dampers]),
+        added_damping=np.concatenate([each.added_damping for each in dampers]),
+        quality=max(each.quality for each in dampers),
+        margins=tuple(found for each in dampers for found in each.margins),
+        noise=tuple(found for each in dampers for found in each.noise),
+        note="; coordinate 2 ".join(each.note for each in dampers),
+    )
 
 
 def turns(parts: tuple[Oscillator, ...]) -> float:

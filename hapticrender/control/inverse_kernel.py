@@ -28,7 +28,7 @@ from hapticrender.control.inverse_learning import (
     note_device,
     reset_parameters,
     revert,
-    suspect_lift,
+    suspect_change,
 )
 from hapticrender.control.inverse_records import (
     BASIS,
@@ -288,13 +288,8 @@ def inverse_step(state, signals, start, count):
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
                 error0, error1 = c.past[0, (c.sample - 1) & PAST_MASK], c.past[1, (c.sample - 1) & PAST_MASK]
-            elif (
-                open_gate(state, inverse, error0)
-                and v.since > v.initial_end
-                and v.contact > 0.0
-                and c.p.needs_contact == 0.0
-            ):
-                suspect_lift(inverse)
+            elif open_gate(state, inverse, error0) and v.since > v.initial_end and c.p.needs_contact == 0.0:
+                suspect_change(inverse)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
                 if learning and implausible == 0:

@@ -26,6 +26,7 @@ from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.mathx import TURN
 
 FARTHEST_LEVER = 2.0  # no surface is longer
+UNREPORTED = 15e3  # N/m, of the coupling, for a finger whose place is not known yet: 12 N s/m or 10 g, the prior's most
 
 
 @kernel
@@ -178,21 +179,28 @@ def restart(inverse):
 
 
 @kernel
-def suspect_lift(inverse):
-    """Learn at once whether the finger is still there: all of its estimate becomes uncertain alike.
+def suspect_change(inverse):
+    """Learn at once from a deviation that no report explains: a touch and a lift are reported late.
 
-    A lift is reported late.
+    An untouched device counts as touched in the middle, until the report is due; that the finger may be elsewhere makes
+    the coupling and the moment uncertain.  Of a finger that may have left all of its estimate is uncertain alike.
     """
     v = record(inverse, INVERSE_T, 0)
     theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
             covariance[i, j] = covariance[j, i] = v.prior_covariance[i, j]
-    for i in range(FINGER, HEAVE):
-        for j in range(FINGER, HEAVE):
-            covariance[i, j] += theta[i] * theta[j]
+    if v.contact > 0.0:
+        v.since = v.relearning_delay
+        for i in range(FINGER, HEAVE):
+            for j in range(FINGER, HEAVE):
+                covariance[i, j] += theta[i] * theta[j]
+    else:
+        v.contact, v.lever, v.away, v.since = 1.0, 0.0, -v.report_delay, v.learning_delay
+        for i in range(COUPLING, LOAD):
+            covariance[i, i] += UNREPORTED * UNREPORTED
+        covariance[LOAD + 1, LOAD + 1] = v.prior_covariance[LOAD, LOAD]
     restart_regressors(inverse)
-    v.since = v.relearning_delay
 
 
 @kernel
@@ -206,9 +214,12 @@ def follow_contact(controller, inverse):
         v.lever = min(max(v.lever_per_metre * c.held_position, -FARTHEST_LEVER), FARTHEST_LEVER)
     v.since += 1.0
     sticks = c.p.needs_contact > 0.0 and c.speed < c.p.least_speed
-    touching = 0.0 if sticks else c.finger_seen
+    touching, suspected = 0.0 if sticks else c.finger_seen, v.away < 0.0
     v.away = 0.0 if touching > 0.0 else v.away + 1.0
-    if v.contact > 0.0 and v.away < v.loss_time:  # a position that is missing for so short is no lift-off
+    if suspected and touching > 0.0:  # what was learned of the finger stays
+        v.since, c.fast_timer = 0.0, v.damper_time
+        restore_device(inverse)
+    if v.contact > 0.0 and v.away < (0.0 if suspected else v.loss_time):  # a position missing so short is no lift-off
         touching = 1.0
     if touching != v.contact:
         v.contact, v.since = touching, 0.0
