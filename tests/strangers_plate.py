@@ -205,3 +205,26 @@ class StrangersPlate:
         touching = self._touched(first - self._lag, last - 1 - self._lag)[:, 2] > 0.0
         position, load = np.where(touching, touch[:-1, 0], np.nan), np.where(touching, touch[:-1, 1], 0.0)
         return hr.Sensed(sensed, position, normal_load=load)
+
+
+def plate(parameters, finger, *, seed=0, block=1, delay=1):
+    """Make a plate for a case of the accuracy suite; contact is reported 5 ms late."""
+    p, bends = parameters, parameters.bending_frequency > 0.0
+    truth = {name: getattr(p, name) for name in TRUTH if not name.startswith("gain")}
+    truth |= {"gain_1": p.sensor_gain_1, "gain_2": p.sensor_gain_2, "delay": p.delay - block + 1}
+    parts = ("mass", "damping", "stiffness")
+    mechanics = [getattr(finger.mechanics, prefix + part) for prefix in ("", "phalanx_") for part in parts]
+    return StrangersPlate(
+        finger=mechanics,
+        position=lambda time: np.nan_to_num(finger.motion.position(time)),
+        load=lambda time: finger.touch(time)[:, 1] / np.maximum(finger.touch(time)[:, 2], 1e-9),
+        contact=lambda time: finger.touch(time)[:, 2],
+        bending=(p.bending_frequency, 0.5 / p.bending_damping, p.bending_coil) if bends else None,
+        substeps=12 if bends else None,
+        rate=p.rate,
+        block=block,
+        told=delay,
+        report_lag=5e-3,
+        seed=seed,
+        **truth,
+    )
