@@ -134,6 +134,28 @@ class StrangersPlate:
         self._rng = np.random.default_rng(seed)
         self._z, self._truth, self._contact = self._equilibrium(), [], []
 
+    @classmethod
+    def of(cls, parameters, finger, *, seed=0, block=1, delay=1):
+        """Make a plate for a case of the accuracy suite; contact is reported 5 ms late."""
+        p, bends = parameters, parameters.bending_frequency > 0.0
+        truth = {name: getattr(p, name) for name in TRUTH if not name.startswith("gain")}
+        truth |= {"gain_1": p.sensor_gain_1, "gain_2": p.sensor_gain_2, "delay": p.delay - block + 1}
+        parts = ("mass", "damping", "stiffness")
+        return cls(
+            finger=[getattr(finger.mechanics, prefix + part) for prefix in ("", "phalanx_") for part in parts],
+            position=lambda time: np.nan_to_num(finger.motion.position(time)),
+            load=lambda time: finger.touch(time)[:, 1] / np.maximum(finger.touch(time)[:, 2], 1e-9),
+            contact=lambda time: finger.touch(time)[:, 2],
+            bending=(p.bending_frequency, 0.5 / p.bending_damping, p.bending_coil) if bends else None,
+            substeps=12 if bends and p.rate < 20e3 else None,
+            rate=p.rate,
+            block=block,
+            told=delay,
+            report_lag=5e-3,
+            seed=seed,
+            **truth,
+        )
+
     def _course(self, given):
         """Values at sample numbers."""
         if callable(given):
@@ -207,24 +229,4 @@ class StrangersPlate:
         return hr.Sensed(sensed, position, normal_load=load)
 
 
-def plate(parameters, finger, *, seed=0, block=1, delay=1):
-    """Make a plate for a case of the accuracy suite; contact is reported 5 ms late."""
-    p, bends = parameters, parameters.bending_frequency > 0.0
-    truth = {name: getattr(p, name) for name in TRUTH if not name.startswith("gain")}
-    truth |= {"gain_1": p.sensor_gain_1, "gain_2": p.sensor_gain_2, "delay": p.delay - block + 1}
-    parts = ("mass", "damping", "stiffness")
-    mechanics = [getattr(finger.mechanics, prefix + part) for prefix in ("", "phalanx_") for part in parts]
-    return StrangersPlate(
-        finger=mechanics,
-        position=lambda time: np.nan_to_num(finger.motion.position(time)),
-        load=lambda time: finger.touch(time)[:, 1] / np.maximum(finger.touch(time)[:, 2], 1e-9),
-        contact=lambda time: finger.touch(time)[:, 2],
-        bending=(p.bending_frequency, 0.5 / p.bending_damping, p.bending_coil) if bends else None,
-        substeps=12 if bends else None,
-        rate=p.rate,
-        block=block,
-        told=delay,
-        report_lag=5e-3,
-        seed=seed,
-        **truth,
-    )
+plate = StrangersPlate.of

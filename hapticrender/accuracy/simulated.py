@@ -33,8 +33,8 @@ class SimulatedPlate(BaseDriver):
         return np.column_stack([(shape(place) * coordinates).sum(axis=1), moved[:, 1:], moved[:, 0]])
 
     def device_loop(self, controller: Controller) -> DeviceLoop | None:
-        """Return the compiled loop of plate and controller; None in blocks."""
-        if self.block > 1 or not self._plate.closes(controller):
+        """Return the compiled loop of plate and controller; None where it has none."""
+        if not self._plate.closes(controller):
             return None
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:

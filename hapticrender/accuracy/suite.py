@@ -144,7 +144,8 @@ def run_suite(
     """Run cases (of `CASES`) and return every figure, target by target, method by method.
 
     What diverges, is stopped, or refuses a case, counts as infinite.  One of `METHOD_FREE` is run once for all methods.
-    `progress` is called with a line before each, and the reason of a refusal or stop.  `bench` holds arguments of `plate.Bench`, for the cases of plates.
+    `progress` is called with a line before each, and the reason of a refusal or stop.  `bench` holds arguments of
+    `plate.Bench`, for the cases of plates.
     """
     found: dict[tuple[str, str], dict[str, float]] = {}
     chosen, methods = list(cases), list(methods)
