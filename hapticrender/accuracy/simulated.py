@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Self
 
 import numpy as np
 
-from hapticrender.drivers.base import BaseDriver
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Array, Controller, DeviceLoop, Sensed
 from hapticrender.touch.finger import Finger
 
 
-class SimulatedPlate(BaseDriver):
+class SimulatedPlate:
     """A plate with a finger; of the plate it states a `delay` (samples) alone, which need not be the true one."""
 
+    drive_channels = sensed_channels = 2
     probe = False  # the clock of the finger starts with the first sample
 
     def __init__(
@@ -22,7 +23,13 @@ class SimulatedPlate(BaseDriver):
     ) -> None:
         self._parameters, self._moved, self._place = parameters, [np.zeros((0, 3))], [np.zeros(0)]
         self._plate = Plate(parameters, finger, seed, block)
-        super().__init__(rate=parameters.rate, drive_channels=2, sensed_channels=2, block=block, delay=delay)
+        self.rate, self.block, self.delay = parameters.rate, block, delay
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
 
     @property
     def truth(self) -> Array:
@@ -44,7 +51,8 @@ class SimulatedPlate(BaseDriver):
 
         return advance
 
-    def _play(self, drive: Array) -> Sensed:
+    def play(self, drive: Array) -> Sensed:
+        """Play a block."""
         return self._kept(self._plate.run(drive))
 
     def _kept(self, sensed: Sensed) -> Sensed:
