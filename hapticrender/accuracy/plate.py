@@ -121,7 +121,7 @@ class Bench:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", PlateMismatch)  # it is not the plate of the design
             render(scene, driver=driver, method=self.method)
-        step = round(driver.rate // RATE)  # what is judged ends at 500 Hz
+        step = max(round(driver.rate // RATE), 1)  # what is judged ends at 500 Hz
         time = np.arange(0, round(seconds * driver.rate), step) / driver.rate
         truth = driver.truth[: step * len(time) : step]
         return Run(time, truth, texture.waveform(time, finger.position(time)))
@@ -156,9 +156,9 @@ def worse(errors: Array) -> Array:
     return np.array([errors[0], errors[1:].max()])
 
 
-def places(errors: Array, first: str = "finger") -> dict[str, float]:
-    """Name an error under the finger, or at another place, and one at the worse end."""
-    return dict(zip((first, "end"), errors.tolist(), strict=True))
+def places(errors: Array) -> dict[str, float]:
+    """Name errors under the finger and at the worse end."""
+    return dict(zip(("finger", "end"), errors.tolist(), strict=True))
 
 
 def noise(bench: Bench) -> dict[str, float]:
@@ -254,19 +254,19 @@ def touch(
     at: Iterable[float] = PLACES,
 ) -> dict[str, float]:
     """Touch in 1 ms and lift-off in a sample at 143-400 Hz, worst finger and place: peaks, centre's return and rest."""
-    peak, back, left = np.zeros(2), 0.0, 0.0
+    peak, back, left = np.zeros(4), 0.0, 0.0
     for frequency, (mechanics, load), place in product(FREQUENCIES[5:], fingers, at):
         pressing = ((0.0, 1.0, 1.001), (1e-4 * load, 1e-4 * load, load))
         finger = Finger(Still(place), pressing, ((1.0, 2.0),), mechanics)
         run = bench.play(bench.tone(frequency, amplitude), 3.0, finger)
-        time, envelope = run.tone(frequency, [CENTRE, *ENDS], hop=1e-3)
+        time, envelope = run.tone(frequency, [*EVERY, CENTRE], hop=1e-3)
         error = abs(amplitude_error(envelope, amplitude))
         for start in (1.0, 2.0):
             near = (time > start - 0.02) & (time < start + 0.9)
-            peak = np.maximum(peak, worse(error[near].max(axis=0)))
-            back = max(back, float(time[near & (error[:, 0] > 0.05)].max(initial=start) - start))
-            left = max(left, float(error[near & (time > start + 0.6), 0].max()))
-    return places(peak, "centre") | {"back": back, "left": left}
+            peak = np.maximum(peak, error[near].max(axis=0))
+            back = max(back, float(time[near & (error[:, CENTRE] > 0.05)].max(initial=start) - start))
+            left = max(left, float(error[near & (time > start + 0.6), CENTRE].max()))
+    return places(worse(peak[EVERY])) | {"centre": float(peak[CENTRE]), "back": back, "left": left}
 
 
 def small(bench: Bench) -> dict[str, float]:

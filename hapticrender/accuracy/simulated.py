@@ -21,7 +21,7 @@ class SimulatedPlate:
     def __init__(
         self, parameters: PlateParameters, finger: Finger, *, seed: int = 0, block: int = 1, delay: int = 1
     ) -> None:
-        self._parameters, self._moved, self._place = parameters, [np.zeros((0, 3))], [np.zeros(0)]
+        self._parameters, self._finger, self._moved = parameters, finger, [np.zeros((0, 3))]
         self._plate = Plate(parameters, finger, seed, block)
         self.rate, self.block, self.delay = parameters.rate, block, delay
 
@@ -33,9 +33,9 @@ class SimulatedPlate:
 
     @property
     def truth(self) -> Array:
-        """Displacement (m, (n, 4)) under the finger (lifted: in the middle), at both ends and in the middle."""
-        moved, place = np.concatenate(self._moved), np.nan_to_num(np.concatenate(self._place))
-        shape = self._parameters.displacement
+        """Displacement (m, (n, 4)) under the finger (lifted: where it would touch), at both ends and in the middle."""
+        moved, shape = np.concatenate(self._moved), self._parameters.displacement
+        place = np.nan_to_num(self._finger.motion.position(np.arange(len(moved)) / self.rate))
         coordinates = moved @ np.linalg.inv(shape([0.0, *self._parameters.ends])).T
         return np.column_stack([(shape(place) * coordinates).sum(axis=1), moved[:, 1:], moved[:, 0]])
 
@@ -58,5 +58,4 @@ class SimulatedPlate:
     def _kept(self, sensed: Sensed) -> Sensed:
         """Keep the motion, and state none."""
         self._moved.append(self._plate.motion[:, :3])
-        self._place.append(np.asarray(sensed.position))
         return sensed._replace(motion=None)

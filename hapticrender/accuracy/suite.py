@@ -79,6 +79,7 @@ PLATES: tuple[
     ("sweeps", "rigid plate, sweep under a finger, rms", "%", {"200 Hz/s": (0.3, 0.15), "400 Hz/s": (0.3, 0.15)}),
     ("sweeps", "rigid plate, sweep under a finger, rms", "%", {"800 Hz/s": (0.5, 0.25), "1600 Hz/s": (1, 0.5)}),
     ("touch", "touch in 1 ms, lift-off in a sample: peak", "%", {"centre": (9, 6), "end": (22, 12)}),
+    ("touch", "the same, at 0, 15 and 27.5 mm", "%", {"finger": (22, 12)}),
     ("touch", "the same: centre back within 5 %", "ms", {"back": (50, 25)}),
     ("touch", "the same: left after 0.6 s (a limit cycle would show)", "%", {"left": (5, 1)}),
     ("touch wrong", "the same, plate wrong in everything", "%", {"centre": (11, 11), "end": (22, 22)}),
