@@ -128,7 +128,8 @@ def _add_checks(choices: Any) -> None:
         "A scene that cannot be judged is counted, skipped in JUnit, and no pass in JSON."
     )
     validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
-    text = "instead of scenes: accuracy, all targets of the library"
+    text = "instead of scenes: accuracy, all targets of the library, or the cases with SCENE in their names; "
+    text += "--driver module:callable plays those of plates on yours (hapticrender.accuracy.plate.Bench)"
     validate.add_argument("--suite", metavar="NAME", choices=["accuracy"], help=text)
     validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
     validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")

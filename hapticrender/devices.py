@@ -84,7 +84,7 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
         factory = registered("drivers", name)
     else:
         called, colon, argument = argument.partition(":")
-        factory = _imported(text, name, called)
+        factory = imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
             options = {"overwrite": True} if overwrite and "overwrite" in inspect.signature(factory).parameters else {}
@@ -137,7 +137,7 @@ def naming_driver(text: str, *passed: type[Exception]) -> Iterator[None]:
         raise DriverError(f"{text}: {type(error).__name__}: {error}") from error
 
 
-def _imported(text: str, module: str, called: str) -> Any:
+def imported(text: str, module: str, called: str) -> Any:
     """Return what "module:callable" names; a ValueError lists the drivers that are installed."""
     if not called:
         try:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticrender import __version__, defaults
-from hapticrender.devices import naming_driver, open_driver, registered
+from hapticrender.devices import SIMULATED, imported, naming_driver, open_driver, registered
 from hapticrender.devices import text as devices_text
 from hapticrender.errors import naming
 from hapticrender.formatting import printable, table
@@ -197,18 +197,31 @@ def validate(arguments: argparse.Namespace) -> int:
 
 
 def _suite(arguments: argparse.Namespace) -> int:
-    """Run the accuracy suite with the chosen method and with "paper"; exit status 1 where it misses a bound."""
-    from hapticrender.accuracy.suite import as_rows, run_suite, write_json
+    """Run the accuracy suite; exit status 1 where the chosen method misses a bound.
+
+    On simulated devices "paper" beside it; on plates that a driver's callable makes, their cases alone.
+    """
+    from hapticrender.accuracy import plate
+    from hapticrender.accuracy.suite import CASES, as_rows, run_suite, write_json
     from hapticrender.report.outputs import check_file
 
     chosen = arguments.method or defaults.METHOD
-    simulated = arguments.driver == "simulated"
-    if arguments.scenes or arguments.junit or arguments.out or arguments.jobs > 1 or not simulated:
-        raise ValueError("--suite runs no scenes, on simulated devices, and writes --json only")
+    if arguments.junit or arguments.out or arguments.jobs > 1:
+        raise ValueError("--suite runs in one process, and writes --json only")
     if arguments.json:
         check_file("--json", arguments.json)
-    methods = list(dict.fromkeys((chosen, "paper")))
-    figures = run_suite(methods, progress=lambda line: print(line, file=sys.stderr))
+    methods, cases, bench = list(dict.fromkeys((chosen, "paper"))), CASES, dict[str, Any]()
+    if arguments.driver != SIMULATED:
+        methods, cases = [chosen], tuple(plate.CASES)
+        bench["make"] = imported(arguments.driver, *arguments.driver.partition(":")[::2])
+    if arguments.seed is not None:
+        bench["seed"] = arguments.seed
+    if arguments.scenes:
+        cases = tuple(case for case in cases if any(text in case for text in arguments.scenes))
+    if not cases:
+        raise ValueError(f"{arguments.scenes}: must be parts of the names of cases, which are {', '.join(CASES)}")
+    with naming_driver(arguments.driver):
+        figures = run_suite(methods, cases, lambda line: print(line, file=sys.stderr), **bench)
     print(table(as_rows(figures, methods)))
     if arguments.json:
         write_json(_made(arguments.json), figures)

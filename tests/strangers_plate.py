@@ -12,10 +12,14 @@ phi is the first symmetric shape of a free bar, 1 at its ends; the finger moves 
 by Runge and Kutta's rule of fourth order, with contact, load and position linear between two samples.
 """
 
+import sys
+
 import numba
 import numpy as np
 
 import hapticrender as hr
+
+sys.modules.setdefault("strangers_plate", sys.modules[__name__])  # kernels cached under this name are found under both
 
 TRUTH = {  # Grigorii et al. 2021; the bending mode is that of `bending`
     "mass": 32e-3,
@@ -134,6 +138,28 @@ class StrangersPlate:
         self._rng = np.random.default_rng(seed)
         self._z, self._truth, self._contact = self._equilibrium(), [], []
 
+    @classmethod
+    def of(cls, parameters, finger, *, seed=0, block=1, delay=1):
+        """Make a plate for a case of the accuracy suite; contact is reported 5 ms late."""
+        p, bends = parameters, parameters.bending_frequency > 0.0
+        truth = {name: getattr(p, name) for name in TRUTH if not name.startswith("gain")}
+        truth |= {"gain_1": p.sensor_gain_1, "gain_2": p.sensor_gain_2, "delay": p.delay - block + 1}
+        parts = ("mass", "damping", "stiffness")
+        return cls(
+            finger=[getattr(finger.mechanics, prefix + part) for prefix in ("", "phalanx_") for part in parts],
+            position=lambda time: np.nan_to_num(finger.motion.position(time)),
+            load=lambda time: finger.touch(time)[:, 1] / np.maximum(finger.touch(time)[:, 2], 1e-9),
+            contact=lambda time: finger.touch(time)[:, 2],
+            bending=(p.bending_frequency, 0.5 / p.bending_damping, p.bending_coil) if bends else None,
+            substeps=12 if bends and p.rate < 20e3 else None,
+            rate=p.rate,
+            block=block,
+            told=delay,
+            report_lag=5e-3,
+            seed=seed,
+            **truth,
+        )
+
     def _course(self, given):
         """Values at sample numbers."""
         if callable(given):
@@ -205,3 +231,6 @@ class StrangersPlate:
         touching = self._touched(first - self._lag, last - 1 - self._lag)[:, 2] > 0.0
         position, load = np.where(touching, touch[:-1, 0], np.nan), np.where(touching, touch[:-1, 1], 0.0)
         return hr.Sensed(sensed, position, normal_load=load)
+
+
+plate = StrangersPlate.of

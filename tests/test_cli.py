@@ -312,8 +312,24 @@ BAD_ARGUMENTS = [
     (["latency", "--driver", "audio:no such card"], "audio:"),
     (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
-    (["validate", "--suite", "accuracy", "--driver", PLATE], "--suite runs no scenes, on simulated devices"),
+    (["validate", "--suite", "accuracy", "--jobs", "2"], "--suite runs in one process, and writes --json only"),
+    (["validate", "--suite", "accuracy", "tea"], "['tea']: must be parts of the names of cases, which are white, "),
+    (["validate", "--suite", "accuracy", "--driver", "other_plate:no"], "module 'other_plate' has no attribute 'no'"),
 ]
+
+
+def test_the_accuracy_suite_plays_chosen_cases_on_a_plate_of_the_users(run, tmp_path):
+    """Its callable gets parameters and a finger; one that takes neither is named."""
+    report = tmp_path / "a.json"
+    suite = ("validate", "--suite", "accuracy", "--driver")
+    status, out, _ = run(*suite, "hapticrender.accuracy.simulated:SimulatedPlate", "modul", "overl", "--json", report)
+    assert status == 0
+    assert "MISSED" not in out
+    figures = json.loads(report.read_text(encoding="utf-8"))["figures"]
+    assert [each["case"] for each in figures] == ["modulation", "overload", "overload"]
+    status, _, errors = run(*suite, PLATE, "white")
+    assert status == 2
+    assert errors[-1].startswith(f"hapticrender: {PLATE}: TypeError: ")
 
 
 @pytest.mark.parametrize(("arguments", "words"), BAD_ARGUMENTS, ids=range(len(BAD_ARGUMENTS)))

@@ -14,7 +14,7 @@ class SensorlessPlate(StrangersPlate):
 
     def play(self, drive):
         super().play(drive)
-        return Sensed(np.empty((self.block, 0)))
+        return Sensed(np.empty((self.block, 0)), np.full(self.block, np.nan))
 
 
 class AlongPath:

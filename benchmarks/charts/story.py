@@ -1,6 +1,6 @@
 """Draw white noise under a finger that touches, slides and leaves: constant gain, open inverse, the paper, and ours.
 
-Played on the plate of ``tests/strangers_plate.py``; errors as in `benchmarks.figures`, from that plate's truth.
+Played on the plate of ``tests/strangers_plate.py``; errors as in `hapticrender.accuracy`, from that plate's truth.
 """
 
 from __future__ import annotations
@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import figures
 from benchmarks.charts.open_loop import SensorlessPlate
 from benchmarks.charts.style import BLUE, GREEN, INK, ORANGE, PALE, new_figure, rounded
-from hapticrender import strongest_carriers
+from hapticrender import Finger, strongest_carriers
+from hapticrender.accuracy.plate import FINGER, RIGID, Bench, Run, rms
+from hapticrender.accuracy.signals import Path, sliding, white
 from hapticrender.bands import Bands
+from hapticrender.plants.plate import PlateParameters
+from hapticrender.touch.mechanics import HEAVY
 from tests.strangers_plate import FORCE_CONSTANT, TRUTH, StrangersPlate
 
 RATE, SECONDS, RAMP = 5000, 5.0, 10e-3  # Hz, s, s: within which the finger touches, and leaves
@@ -22,6 +25,8 @@ WINDOW = 0.05  # s
 ZOOM = (2.7, 2.74)  # s
 JUDGED = {"before": (0.5, 1.25), "sliding": (2.0, 3.25), "after": (4.0, 4.95)}  # s
 CARRIERS = 8
+PRESSING = (TOUCH[0], TOUCH[0] + RAMP, TOUCH[1] - RAMP, TOUCH[1]), (0.0, 0.8, 0.8, 0.0)  # s, N
+WHO = Finger(Path(sliding), PRESSING, (TOUCH,), HEAVY, load_scaling=True)
 NOTE = """Error: rms(y - r)/rms(r) of the true motion y under the finger, in windows
 of 50 ms, 20-500 Hz, without shift or gain fit. Grey line: no motion at all.
 The load of 0.8 N alone moves the plate under the finger by 31 µm."""
@@ -41,35 +46,28 @@ class OnCarriers:
         return Bands(frequency=self.frequency, wavenumber=nothing, phase=nothing)
 
 
-def contact(time: Any) -> Any:
-    """Contact of the finger, 0 to 1."""
-    return np.clip(np.minimum(time - TOUCH[0], TOUCH[1] - time) / RAMP, 0.0, 1.0)
-
-
-def play(texture: Any, **how: Any) -> figures.Run:
+def play(texture: Any, method: str = "inverse", make: Any = StrangersPlate) -> Run:
     """Play under the heavy finger."""
-    return figures.play(texture, SECONDS, "4H", figures.sliding, contact, **how)
+    return Bench(method=method, make=make.of).of(**RIGID).play(texture, SECONDS, WHO)
 
 
-def constant_gain(texture: Any) -> figures.Run:
+def constant_gain(texture: Any) -> Run:
     """Play with a drive of (k_1 + k_2)/(2 K_T) times the reference: right for slow motion of the free plate."""
     samples = round(SECONDS * RATE)
     time = np.arange(samples) / RATE
     reference = texture.waveform(time, None)
     gain = (TRUTH["stiffness_1"] + TRUTH["stiffness_2"]) / (2 * FORCE_CONSTANT)
-    mechanics, load = figures.FINGERS["4H"]
-    touched = {"finger": mechanics, "load": load, "position": figures.sliding, "contact": contact}
-    plate = StrangersPlate(block=samples, **touched)  # type: ignore[no-untyped-call]
+    plate = StrangersPlate.of(PlateParameters(delay=samples), WHO, block=samples)  # type: ignore[no-untyped-call]
     plate.play(np.outer(gain * reference, np.ones(2)))
-    return figures.Run(time, plate.truth, np.full(samples, np.nan), reference)
+    return Run(time, plate.truth, reference)
 
 
-def measure() -> dict[str, figures.Run]:
+def measure() -> dict[str, Run]:
     """Play the same waveform in four ways."""
-    texture = figures.white()
+    texture = white(1)
     return {
         "Constant gain": constant_gain(texture),
-        "Open inverse of the free plate": play(texture, device=SensorlessPlate),
+        "Open inverse of the free plate": play(texture, make=SensorlessPlate),
         f"Controller of Grigorii et al. 2021, common mode, {CARRIERS} carriers": play(
             OnCarriers(texture), method="paper-common"
         ),
@@ -77,19 +75,19 @@ def measure() -> dict[str, figures.Run]:
     }
 
 
-def over_time(run: figures.Run) -> tuple[Any, Any, dict[str, float]]:
+def over_time(run: Run) -> tuple[Any, Any, dict[str, float]]:
     """Middle times (s) and errors under the finger (%) of windows, and of the spans of `JUDGED`, 20 to 500 Hz."""
-    reference, error = figures.in_band(run)
+    reference, error = run.in_band()
     size = round(WINDOW * RATE)
     count = len(error) // size
-    whole = figures.rms(reference)
-    windows = 100 * figures.rms(error[: count * size, figures.FINGER].reshape(count, size), 1) / whole
+    whole = rms(reference)
+    windows = 100 * rms(error[: count * size, FINGER].reshape(count, size), 1) / whole
     spans = {name: slice(*(round(each * RATE) for each in span)) for name, span in JUDGED.items()}
-    judged = {name: 100 * figures.rms(error[at, 0]) / figures.rms(reference[at]) for name, at in spans.items()}
+    judged = {name: 100 * rms(error[at, 0]) / rms(reference[at]) for name, at in spans.items()}
     return (np.arange(count) + 0.5) * WINDOW, windows, judged
 
 
-def draw(runs: dict[str, figures.Run]) -> Any:
+def draw(runs: dict[str, Run]) -> Any:
     """Draw a row for each way: its error over time in numbers, and a piece of the motion under the finger."""
     with new_figure((11, 8.4)) as figure:
         axes = figure.subplots(5, 2, sharex="col", width_ratios=[1.5, 1], height_ratios=[2, 2, 2, 2, 1])
@@ -102,7 +100,7 @@ def draw(runs: dict[str, figures.Run]) -> Any:
         axes[4, 1].set_axis_off()
         axes[4, 1].text(0.0, 0.6, NOTE, transform=axes[4, 1].transAxes, va="top", fontsize=8)
         time = np.arange(0.0, SECONDS, 1e-3)
-        place = np.where(contact(time) > 0, 1e3 * figures.sliding(time), np.nan)
+        place = 1e3 * WHO.position(time)
         axes[4, 0].axvspan(*TOUCH, color="#DDEBF5", lw=0)
         axes[4, 0].plot(time, place, color=INK, lw=1.2)
         axes[4, 0].set(ylim=(-30, 30), xlim=(0.0, SECONDS), ylabel="finger\n(mm)", xlabel="time (s)")
@@ -110,7 +108,7 @@ def draw(runs: dict[str, figures.Run]) -> Any:
     return figure
 
 
-def _errors(axes: Any, name: str, run: figures.Run, color: str) -> None:
+def _errors(axes: Any, name: str, run: Run, color: str) -> None:
     """Draw the error over time, and write it where it has settled."""
     time, windows, judged = over_time(run)
     axes.axvspan(*TOUCH, color="#DDEBF5", lw=0)
@@ -124,10 +122,10 @@ def _errors(axes: Any, name: str, run: figures.Run, color: str) -> None:
     axes.minorticks_off()
 
 
-def _waves(axes: Any, run: figures.Run, color: str) -> None:
+def _waves(axes: Any, run: Run, color: str) -> None:
     """Draw what was played and what was requested, 20 to 500 Hz."""
-    reference, error = figures.in_band(run)
+    reference, error = run.in_band()
     here = slice(*(round(each * RATE) for each in ZOOM))
-    axes.plot(run.time[here], 1e6 * (reference + error[:, figures.FINGER])[here], color=color, lw=2.2)
+    axes.plot(run.time[here], 1e6 * (reference + error[:, FINGER])[here], color=color, lw=2.2)
     axes.plot(run.time[here], 1e6 * reference[here], color=INK, lw=1.0, ls="--")
     axes.set(xlim=ZOOM, ylim=(-22.0, 22.0))

@@ -1,8 +1,9 @@
 """Measure and draw the error of whole waveforms by signal, finger and speed: `inverse` against the open inverse.
 
 On the plate of ``tests/strangers_plate.py`` through ``hr.render``; E = rms(y - r)/rms(r) of its true motion, 20-500 Hz,
-without shift or gain fit, under the finger and at the worse end (`benchmarks.figures`).  The open inverse is the same
-method on the same plate without sensors: of the free plate, with the finger's path known beforehand.
+without shift or gain fit, under the finger and at the worse end (`hapticrender.accuracy`).  The glass is rigid.  The
+open inverse is the same method on the same plate without sensors: of the free plate, with the finger's path known
+beforehand.
 """
 
 from __future__ import annotations
@@ -13,37 +14,41 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks import figures
 from benchmarks.charts.open_loop import AlongPath, SensorlessPlate
 from benchmarks.charts.style import BLUE, INK, ORANGE, new_figure, rounded
-from hapticrender import Grating
+from hapticrender import Finger, Grating, Recorded
+from hapticrender.accuracy import signals
+from hapticrender.accuracy.plate import RIGID, Bench, draw_fingers
+from hapticrender.touch.mechanics import HEAVY, LIGHT, NONE
+from tests.strangers_plate import StrangersPlate
 
 SPEED, SPEEDS = 0.1, (0.04, 0.08, 0.15, 0.3)  # m/s
-RANDOM = 6  # the first of the random fingers of `benchmarks.figures`
+RANDOM = 6  # the first of the random fingers of the accuracy suite
 RMS = 5e-6  # m: of every waveform
 BLOCK = 20  # samples of the open inverse: the reference is known ahead, so only the rounding of its drive depends on it
+HEAVIER = (HEAVY, 0.8)
 TONES = (47.0, 120.0, 178.0, 261.0)  # Hz
 LAWS = {"inverse": BLUE, "open inverse of the free plate": ORANGE}
 FINGERS = ("no finger", "light finger, 0.3 N", "heavy finger, 0.8 N", f"{RANDOM} random fingers, 0.5 N")
 
 
-def tones() -> figures.Wave:
+def tones(seed: int) -> Recorded:
     """Four tones together, at random phases."""
-    phases = np.random.default_rng(figures.options.seed).uniform(0.0, 2 * np.pi, len(TONES))
-    turns = np.multiply.outer(np.arange(round(5 * figures.FINE)) / figures.FINE, TONES)
-    return figures.Wave(np.sin(2 * np.pi * turns + phases).sum(axis=1))
+    phases = np.random.default_rng(seed).uniform(0.0, 2 * np.pi, len(TONES))
+    turns = np.multiply.outer(np.arange(round(5 * signals.FINE)) / signals.FINE, TONES)
+    return signals.recorded(np.sin(2 * np.pi * turns + phases).sum(axis=1))
 
 
-def ridges() -> Grating:
+def ridges(_: int) -> Grating:
     """Ridges of 2 mm with two harmonics: 50, 100 and 150 Hz at 100 mm/s."""
     partials = ((1, 1.0, 0.0), (2, 0.5, 1.0), (3, 1 / 3, 2.0))
     peak = RMS / np.sqrt(sum(size**2 for _, size, _ in partials) / 2)
     return Grating(wavelength=2e-3, amplitude=peak, partials=partials)
 
 
-SIGNALS: dict[str, tuple[Callable[[], Any], float, float]] = {  # texture, length (s), judged from (s)
-    "white": (figures.white, 4.0, 1.5), "pink": (figures.pink, 4.0, 1.5), "chirp": (figures.chirp, 3.0, 0.3),
-    "clicks": (figures.clicks, 4.0, 1.5), "tones": (tones, 4.0, 1.5), "ridges": (ridges, 4.0, 1.5),
+SIGNALS: dict[str, tuple[Callable[[int], Any], float, float]] = {  # texture, length (s), judged from (s)
+    "white": (signals.white, 4.0, 1.5), "pink": (signals.pink, 4.0, 1.5), "chirp": (signals.chirp, 3.0, 0.3),
+    "clicks": (signals.clicks, 4.0, 1.5), "tones": (tones, 4.0, 1.5), "ridges": (ridges, 4.0, 1.5),
 }  # fmt: skip
 
 
@@ -62,11 +67,11 @@ def rows(
     signals: Sequence[str] = tuple(SIGNALS), random: int = RANDOM, speeds: Sequence[float] = SPEEDS
 ) -> Iterator[Row]:
     """Measure every signal under every finger at `SPEED`, and white noise and ridges under a heavy one at `speeds`."""
-    known: list[tuple[str, Any]] = list(zip(FINGERS, (None, "4L", "4H"), strict=False))
-    fingers = known + [(FINGERS[-1], finger) for finger in figures.draw_fingers(random)]
+    known: list[tuple[str, Any]] = list(zip(FINGERS, (None, (LIGHT, 0.3), HEAVIER), strict=False))
+    fingers = known + [(FINGERS[-1], (finger, 0.5)) for finger in draw_fingers(random)]
     cases = [(signal, name, finger, SPEED) for signal in signals for name, finger in fingers]
     cases += [
-        (signal, FINGERS[2], "4H", speed) for signal in ("white", "ridges") if signal in signals for speed in speeds
+        (signal, FINGERS[2], HEAVIER, speed) for signal in ("white", "ridges") if signal in signals for speed in speeds
     ]
     for law in LAWS:
         for signal, name, finger, speed in cases:
@@ -76,15 +81,15 @@ def rows(
 def error(law: str, signal: str, finger: Any, speed: float) -> tuple[float, float]:
     """Play one waveform under a sliding finger; None: there is none, or for ridges a position without a force."""
     make, seconds, start = SIGNALS[signal]
-    texture, path = make(), partial(figures.sliding, speed=speed)
-    plate: dict[str, Any] = {}
+    texture, path = make(1), partial(signals.sliding, speed=speed)
+    bench = Bench(method="inverse", make=StrangersPlate.of).of(**RIGID)
     if law != "inverse":
-        texture, plate = AlongPath(texture, path), {"device": SensorlessPlate, "block": BLOCK}
+        texture, bench = AlongPath(texture, path), Bench(method="inverse", make=SensorlessPlate.of).of(BLOCK, **RIGID)
     if finger is None and signal == "ridges":
-        finger = ((0.0, 0.0, 0.0), 0.0)  # a position without a force
-    if finger:
-        plate |= {"finger": finger, "position": path, "contact": np.ones_like}
-    return figures.wave_error(figures.play(texture, seconds, method="inverse", **plate), start)
+        finger = (NONE, 0.0)  # a position without a force
+    who = finger and Finger(signals.Path(path), finger[1], mechanics=finger[0])
+    at, end = 100 * bench.play(texture, seconds, who).wave_error(start)
+    return float(at), float(end)
 
 
 def draw(found: Sequence[Row]) -> Any:

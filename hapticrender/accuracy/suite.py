@@ -10,16 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hapticrender.accuracy import friction, plate
-from hapticrender.errors import DesignError
+from hapticrender.errors import DesignError, DeviceFault
 from hapticrender.formatting import as_json
 from hapticrender.report.outputs import write_report
 
-SCALE = {"%": 100.0, "ms": 1e3, "um": 1e6, "samples": 1.0}  # of a figure in SI
+SCALE = {"%": 100.0, "ms": 1e3, "um": 1e6, "samples": 1.0, "Hz": 1.0, "fingers": 1.0}  # of a figure in SI
 
 
 class Target(NamedTuple):
@@ -57,32 +57,53 @@ class Figure(NamedTuple):
         return bool(self.value <= self.target.aim)
 
 
+PLATES: tuple[
+    tuple[str, str, str, dict[str, tuple[float, float]]], ...
+] = (  # case, what, unit; bound and aim of each key
+    ("white", "white noise, heavy finger sliding", "%", {"free": (1, 0.4), "free, end": (2, 0.7)}),
+    ("white", "white noise, heavy finger sliding", "%", {"slide": (1, 0.5), "slide, end": (2, 0.9)}),
+    ("white wrong", "plate wrong in all but the delay", "%", {"free": (1.5, 0.8), "free, end": (4, 2.3)}),
+    ("white wrong", "plate wrong in all but the delay", "%", {"slide": (1.5, 0.8), "slide, end": (4, 2.3)}),
+    ("white 48 kHz", "white noise in blocks of 64", "%", {"free": (1, 0.5), "free, end": (2, 0.8)}),
+    ("white 48 kHz", "white noise in blocks of 64", "%", {"slide": (1, 0.5), "slide, end": (2, 0.8)}),
+    ("waves", "pink noise, clicks, chirp, worst of 4 fingers sliding", "%", {"finger": (2, 1.2), "end": (4, 2)}),
+    ("random fingers", "white noise, 24 fingers", "%", {"median": (1, 0.7)}),
+    ("random fingers", "white noise, 24 fingers", "fingers", {"above 5 %": (4, 2)}),
+    ("free", "rigid plate, 11 tones, ends included, noise averaged", "%", {"error": (0.05, 0.03)}),
+    ("free wrong", "the same, plate wrong in everything", "%", {"centre": (1, 0.6)}),
+    ("tones", "rigid plate, 11 tones, heavy finger sliding, rms", "%", {"finger": (0.2, 0.1), "end": (0.5, 0.3)}),
+    ("tones bent", "the same, glass that bends", "%", {"finger": (2, 1), "end": (0.5, 0.3)}),
+    ("tones wrong", "the same, rigid, wrong in everything", "%", {"finger": (1, 0.5)}),
+    ("comb", "rigid plate, 20 lines, heavy finger sliding", "dB", {"finger": (-52, -55), "end": (-45, -50)}),
+    ("comb", "the same, first half second", "dB", {"first": (-35, -40)}),
+    ("sweeps", "rigid plate, sweep under a finger, rms", "%", {"200 Hz/s": (0.3, 0.15), "400 Hz/s": (0.3, 0.15)}),
+    ("sweeps", "rigid plate, sweep under a finger, rms", "%", {"800 Hz/s": (0.5, 0.25), "1600 Hz/s": (1, 0.5)}),
+    ("touch", "touch in 1 ms, lift-off in a sample: peak", "%", {"centre": (9, 6), "end": (22, 12)}),
+    ("touch", "the same, at 0, 15 and 27.5 mm", "%", {"finger": (22, 12)}),
+    ("touch", "the same: centre back within 5 %", "ms", {"back": (50, 25)}),
+    ("touch", "the same: left after 0.6 s (a limit cycle would show)", "%", {"left": (5, 1)}),
+    ("touch wrong", "the same, plate wrong in everything", "%", {"centre": (11, 11), "end": (22, 22)}),
+    ("touch blocks", "touch, blocks of 25 at 5 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),
+    ("touch 48 kHz", "touch, blocks of 64 at 48 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),
+    ("touch 10 um", "touch, 10 um under 0.8 N", "%", {"centre": (30, 30), "end": (70, 70)}),
+    ("small", "rigid plate, 1 um at 20 Hz under 0.5 N", "%", {"pressed": (0.5, 0.5)}),
+    ("small", "rigid plate, mean of a target of 0.1 um", "%", {"0.1 um": (1, 1)}),
+    ("wobble", "wobble of a held 1 um", "um", {"held": (0.015, 0.01)}),
+    ("modulation", "rigid plate, 30 % AM at 5 Hz", "%", {"error": (0.5, 0.5)}),
+    ("late", "rigid plate, known delay of 60 ms", "%", {"error": (1, 0.1)}),
+    ("overload", "2 s of 1 mm at 400 Hz, then 100 um: back within 5 %", "ms", {"back": (250, 220)}),
+    ("overload", "third harmonic while overloaded", "um", {"third": (0.01, 0.005)}),
+    ("identified", "identification in 1 s at 100 um", "%", {"m, I, k": (0.05, 0.05), "b": (0.2, 0.2)}),
+    ("identified", "the same", "samples", {"delay": (0.002, 0.001)}),
+    ("identified", "the same, bending mode", "Hz", {"frequency": (0.5, 0.5)}),
+    ("identified", "the same, bending mode", "%", {"coupling": (5, 5)}),
+)
 TARGETS = (
-    Target("free", "error", "free plate, 11 frequencies, ends included, noise averaged", "%", 0.05, 0.03),
-    Target("slide", "centre", "heavy finger sliding at 100 mm/s, rms at the centre", "%", 0.4, 0.2),
-    Target("slide", "ends", "the same at the ends", "%", 1.5, 0.6),
-    Target("touch", "peak", "touch in 1 ms, lift-off in a sample, 143-400 Hz: peak at the centre", "%", 18.0, 10.0),
-    Target("touch", "back", "the same: back within 5 %", "ms", 50.0, 25.0),
-    Target("touch", "left", "the same: left after 0.6 s (a limit cycle would show)", "%", 5.0, 1.0),
-    Target("chirp", "200 Hz/s", "chirp of 200 Hz/s under a finger, rms", "%", 0.6, 0.4),
-    Target("chirp", "400 Hz/s", "chirp of 400 Hz/s", "%", 0.8, 0.5),
-    Target("chirp", "800 Hz/s", "chirp of 800 Hz/s", "%", 1.5, 0.7),
-    Target("chirp", "1600 Hz/s", "chirp of 1600 Hz/s", "%", 2.5, 1.1),
-    Target("comb", "centre", "20 bands under a sliding heavy finger, centre", "dB", -48.0, -51.0),
-    Target("comb", "ends", "the same at the ends", "dB", -35.0, -40.0),
-    Target("press", "pressed", "1 um at 20 Hz under a press of 0.5 N", "%", 1.0, 0.5),
-    Target("press", "0.1 um", "mean of a target of 0.1 um", "%", 2.0, 1.0),
-    Target("wobble", "held", "wobble of a held amplitude", "um", 0.025, 0.015),
-    Target("wobble", "AM", "30 % AM at 5 Hz", "%", 0.5, 0.5),
-    Target("wrong", "free", "plate wrong (k +5, m -5, b -20 %, gains +-2 %, delay +1): free", "%", 1.0, 0.6),
-    Target("wrong", "touch", "the same: touch", "%", 18.0, 13.0),
-    Target("wrong", "slide", "the same: slide", "%", 1.0, 0.5),
-    Target("late", "error", "known delay of 60 ms: free plate", "%", 1.0, 0.1),
-    Target("overload", "back", "2 s of 1 mm at 400 Hz, then 100 um: back within 5 %", "ms", 250.0, 220.0),
-    Target("overload", "third", "third harmonic while overloaded", "um", 0.01, 0.005),
-    Target("identified", "m, I, k", "identification in 1 s at 100 um: mass, inertia, stiffness", "%", 0.3, 0.1),
-    Target("identified", "b", "the same: damping", "%", 1.0, 0.4),
-    Target("identified", "delay", "the same: delay", "samples", 0.01, 0.001),
+    *(
+        Target(case, key, f"{what}: {key}", unit, *figures)
+        for case, what, unit, rows in PLATES
+        for key, figures in rows.items()
+    ),
     Target("electroadhesion: area", "error", "area +-30 %, gap 0.5-3 um, rms of the force", "%", 3.0, 1.0),
     Target("electroadhesion: harmonic", "second", "second harmonic of friction, with the square root", "%", 0.1, 0.05),
     *(
@@ -111,20 +132,24 @@ TARGETS = (
         for device in ("vt-plate", "electroadhesion", "ultrasonic")
     ),
 )
-CASES: dict[str, Callable[[str], dict[str, float]]] = {**plate.CASES, **friction.CASES}
+CASES = (*plate.CASES, *friction.CASES)
 METHOD_FREE = frozenset(("identified", *friction.WITHOUT_METHOD))  # cases that do not depend on the method
 
 
 def run_suite(
-    methods: Iterable[str], cases: Iterable[str] | None = None, progress: Callable[[str], None] | None = None
+    methods: Iterable[str],
+    cases: Iterable[str] = CASES,
+    progress: Callable[[str], None] | None = None,
+    **bench: Any,
 ) -> list[Figure]:
-    """Run the suite and return every figure, target by target, method by method.
+    """Run cases (of `CASES`) and return every figure, target by target, method by method.
 
-    What diverges, or refuses a case, counts as infinite.  `cases` (of `CASES`) are all by default; one of `METHOD_FREE`
-    is run once for all methods.  `progress` is called with a line before each.
+    What diverges, is stopped, or refuses a case, counts as infinite.  One of `METHOD_FREE` is run once for all methods.
+    `progress` is called with a line before each, and the reason of a refusal or stop.  `bench` holds arguments of
+    `plate.Bench`, for the cases of plates.
     """
     found: dict[tuple[str, str], dict[str, float]] = {}
-    chosen, methods = list(cases or CASES), list(methods)
+    chosen, methods = list(cases), list(methods)
     for case in chosen:
         for method in methods:
             if case in METHOD_FREE and method != methods[0]:
@@ -133,9 +158,14 @@ def run_suite(
             if progress is not None:
                 progress(case if case in METHOD_FREE else f"{case}: {method}")
             try:
-                found[case, method] = CASES[case](method)
-            except DesignError:  # the method refuses the case
+                if case in plate.CASES:
+                    found[case, method] = plate.CASES[case](plate.Bench(method=method, **bench))
+                else:
+                    found[case, method] = friction.CASES[case](method)
+            except (ValueError, DesignError, DeviceFault) as error:  # the method refuses the case, or is stopped
                 found[case, method] = {}
+                if progress is not None:
+                    progress(f"{case}: {method}: {error}")
     return [
         Figure(target, method, target.shown(found[target.case, method].get(target.key, np.inf)))
         for target in TARGETS

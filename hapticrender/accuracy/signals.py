@@ -1,0 +1,81 @@
+"""What the cases of plates play, seeded: waveforms of 5 um rms in time, a modulated tone, and the path of a finger."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticrender.bands import Bands
+from hapticrender.protocols import Array
+from hapticrender.touch.composed import Chirp
+from hapticrender.touch.recorded import Recorded
+
+FINE, RMS = 20e3, 5e-6  # Hz, m: of the samples
+
+
+def recorded(values: Array, low: float = 20.0, high: float = 500.0, exponent: float = 0.0) -> Recorded:
+    """Samples without energy outside low to high (Hz), of a power spectrum f^exponent times theirs, as a texture."""
+    frequency, spectrum = np.fft.rfftfreq(len(values), 1 / FINE), np.fft.rfft(values)
+    inside = (frequency >= low) & (frequency <= high)
+    spectrum[inside] *= frequency[inside] ** (exponent / 2)
+    values = np.fft.irfft(np.where(inside, spectrum, 0.0), len(values))
+    return Recorded(samples=tuple(values), rate=FINE, gain=RMS / float(np.sqrt(np.mean(values**2))))
+
+
+def white(seed: int) -> Recorded:
+    """White noise of 20 to 400 Hz."""
+    return recorded(np.random.default_rng(seed).standard_normal(round(5 * FINE)), high=400.0)
+
+
+def pink(seed: int) -> Recorded:
+    """Pink noise."""
+    return recorded(np.random.default_rng(seed).standard_normal(round(5 * FINE)), exponent=-1.0)
+
+
+def clicks(seed: int) -> Recorded:
+    """One unit impulse every 60 to 140 ms, of either sign."""
+    rng, values = np.random.default_rng(seed), np.zeros(round(5 * FINE))
+    at = np.cumsum(rng.uniform(0.06, 0.14, 35))
+    values[np.round(FINE * at).astype(int)] = rng.choice([-1.0, 1.0], 35)
+    return recorded(values)
+
+
+def chirp(_: int) -> Chirp:
+    """20 to 480 Hz in 3 s."""
+    return Chirp(start=20.0, stop=480.0, duration=3.0, amplitude=RMS * 2**0.5)
+
+
+class Modulated(NamedTuple):
+    """A tone (Hz, m) with 30 % AM at 5 Hz."""
+
+    frequency: float
+    amplitude: float
+
+    def bands(self, rate: float) -> Bands:
+        """No carriers: all of it is played."""
+        return Bands.none(spatial=False)
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Target displacement (m)."""
+        modulated = self.amplitude * (1 + 0.3 * np.cos(2 * np.pi * 5.0 * time))
+        return np.asarray(modulated * np.cos(2 * np.pi * self.frequency * time))
+
+
+class Path(NamedTuple):
+    """A finger's path: position (m) over time (s)."""
+
+    position: Callable[[Array], Array]
+
+
+def sliding(time: Array, speed: float = 0.1) -> Array:
+    """Positions of a finger at `speed` (m/s), to and fro over +-25 mm, turning within 50 ms (4 m/s2 at 100 mm/s).
+
+    Turned at once, the finger's load alone shakes the plate by 1.4 % of 5 um rms, whatever is played.
+    """
+    half = 0.05 / speed  # s, from turn to turn
+    turn = np.round(time / half)
+    since = np.abs(time - half * turn)
+    away = speed * np.where(since < 0.025, since**2 / 0.05 + 0.0125, since)
+    return np.asarray((-1.0) ** turn * (0.025 - away))
