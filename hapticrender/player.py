@@ -256,6 +256,8 @@ class Player(Addressed):
     def end_recording(self) -> Recording:
         """End the recording and return it."""
         with self._lock:
+            if self._loop is not None and self._error is None:
+                self._loop.alive()
             if self._recorder is None:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()

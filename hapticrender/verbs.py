@@ -212,14 +212,16 @@ def _suite(arguments: argparse.Namespace) -> int:
         check_file("--json", arguments.json)
     methods, cases, bench = list(dict.fromkeys((chosen, "paper"))), CASES, dict[str, Any]()
     if arguments.driver != SIMULATED:
-        methods, cases = [chosen], tuple(plate.CASES)
+        methods, cases = [chosen], tuple(case for case in plate.CASES if case != "overload")  # that has its own plate
         bench["make"] = imported(arguments.driver, *arguments.driver.partition(":")[::2])
     if arguments.seed is not None:
         bench["seed"] = arguments.seed
     if arguments.scenes:
-        cases = tuple(case for case in cases if any(text in case for text in arguments.scenes))
-    if not cases:
-        raise ValueError(f"{arguments.scenes}: must be parts of the names of cases, which are {', '.join(CASES)}")
+        named = {text: [case for case in cases if text in case] for text in arguments.scenes}
+        if unknown := [text for text, found in named.items() if not found]:
+            raise ValueError(f"{unknown}: must be names of cases, or parts of them; there are {', '.join(cases)}")
+        wanted = {case for text, found in named.items() for case in ([text] if text in found else found)}
+        cases = tuple(case for case in cases if case in wanted)
     with naming_driver(arguments.driver):
         figures = run_suite(methods, cases, lambda line: print(line, file=sys.stderr), **bench)
     print(table(as_rows(figures, methods)))

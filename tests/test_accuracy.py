@@ -50,6 +50,8 @@ def test_the_banks_of_bands_leave_an_overload_undistorted_in_a_quarter_of_a_seco
 def test_where_the_baselines_fail(case):
     figures = run_suite(["paper", "boxcar"], [case])
     assert len(missed(figures)) == len(figures) > 0
+    if case != "electroadhesion: swipe":  # whose targets grow with the finger's speed, which these refuse
+        assert np.isfinite([each.value for each in figures]).any()
 
 
 def test_the_papers_method_misses_and_the_report_says_so(tmp_path):

@@ -313,7 +313,10 @@ BAD_ARGUMENTS = [
     (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
     (["validate", "--suite", "accuracy", "--jobs", "2"], "--suite runs in one process, and writes --json only"),
-    (["validate", "--suite", "accuracy", "tea"], "['tea']: must be parts of the names of cases, which are white, "),
+    (
+        ["validate", "--suite", "accuracy", "tea"],
+        "['tea']: must be names of cases, or parts of them; there are white, ",
+    ),
     (["validate", "--suite", "accuracy", "--driver", "other_plate:no"], "module 'other_plate' has no attribute 'no'"),
 ]
 
@@ -322,11 +325,13 @@ def test_the_accuracy_suite_plays_chosen_cases_on_a_plate_of_the_users(run, tmp_
     """Its callable gets parameters and a finger; one that takes neither is named."""
     report = tmp_path / "a.json"
     suite = ("validate", "--suite", "accuracy", "--driver")
-    status, out, _ = run(*suite, "hapticrender.accuracy.simulated:SimulatedPlate", "modul", "overl", "--json", report)
+    status, out, _ = run(*suite, "hapticrender.accuracy.simulated:SimulatedPlate", "modul", "late", "--json", report)
     assert status == 0
     assert "MISSED" not in out
     figures = json.loads(report.read_text(encoding="utf-8"))["figures"]
-    assert [each["case"] for each in figures] == ["modulation", "overload", "overload"]
+    assert [each["case"] for each in figures] == ["modulation", "late"]
+    status, _, errors = run(*suite, PLATE, "modulation", "overload")
+    assert (status, "overload" in errors[-1]) == (2, True), "it plays on a plate of its own"
     status, _, errors = run(*suite, PLATE, "white")
     assert status == 2
     assert errors[-1].startswith(f"hapticrender: {PLATE}: TypeError: ")

@@ -344,10 +344,10 @@ def identified(bench: Bench) -> dict[str, float]:
 
 
 def in_blocks(
-    case: Callable[[Bench], dict[str, float]], block: int, rate: float
+    case: Callable[[Bench], dict[str, float]], block: int, rate: float, **plate: Any
 ) -> Callable[[Bench], dict[str, float]]:
-    """Return a case in blocks at a rate (Hz)."""
-    return lambda bench: case(bench.of(block=block, rate=rate, delay=block))
+    """Return a case in blocks at a rate (Hz), on a plate that differs."""
+    return lambda bench: case(bench.of(block=block, rate=rate, delay=block, **plate))
 
 
 CASES: dict[str, Case] = {
@@ -364,10 +364,11 @@ CASES: dict[str, Case] = {
     "comb": lambda bench: comb(bench.of(**RIGID)),
     "sweeps": lambda bench: sweeps(bench.of(**RIGID)),
     "touch": touch,
-    "touch wrong": lambda bench: touch(bench.of(**WRONG)),
-    "touch blocks": in_blocks(touch, 25, 5e3),
-    "touch 48 kHz": in_blocks(touch, 64, 48e3),
-    "touch 10 um": lambda bench: touch(bench, 10e-6, FINGERS[1::2]),
+    "touch rigid": lambda bench: touch(bench.of(**RIGID)),
+    "touch wrong": lambda bench: touch(bench.of(**WRONG | RIGID)),
+    "touch blocks": in_blocks(touch, 25, 5e3, **RIGID),
+    "touch 48 kHz": in_blocks(touch, 64, 48e3, **RIGID),
+    "touch 10 um": lambda bench: touch(bench.of(**RIGID), 10e-6, FINGERS[1::2]),
     "small": lambda bench: small(bench.of(**RIGID)),
     "wobble": wobble,
     "modulation": lambda bench: modulation(bench.of(**RIGID)),

@@ -198,17 +198,22 @@ def choose_damping(
     measured or the model is rigid, else at 2.  Where even a damper of 3.5 times the modes' own damping would not do,
     the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
 
-    `apart`: every coordinate has a damper of its own, or none, each from Q 1.4 on; rocking, which a symmetric bending
-    mode does not couple into, needs no notch.
+    `apart`: every coordinate has a damper of its own, or none; that of rocking, which a symmetric bending mode does not
+    couple into, starts at Q 1.4 and needs no notch.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass), "the device has no mode")
     known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
     plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
+    least = QUALITY if known else QUALITY_UNMEASURED
     if not apart:
-        return _chosen(parts, QUALITY if known else QUALITY_UNMEASURED, bending, plain)
-    modes = [replace(bending, coupling=(each,)) if each else None for each in bending.coupling] if bending else None
-    return _joined([_chosen((part,), QUALITY, modes[i] if modes else None, plain) for i, part in enumerate(parts)])
+        return _chosen(parts, least, bending, plain)
+    dampers = []
+    for i, part in enumerate(parts):
+        coupled = bending is not None and bending.coupling[i] != 0.0
+        mode = replace(bending, coupling=(bending.coupling[i],)) if bending is not None and coupled else None
+        dampers.append(_chosen((part,), least if coupled else QUALITY, mode, plain))
+    return _joined(dampers)
 
 
 def _joined(dampers: list[Damping]) -> Damping:

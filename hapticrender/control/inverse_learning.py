@@ -205,7 +205,7 @@ def suspect_change(inverse):
 
 @kernel
 def follow_contact(controller, inverse):
-    """Reset what belongs to a contact when one begins or ends, and learn afresh: at once, and when its ringing is over.
+    """Reset what belongs to a contact when one begins or ends, and learn afresh, once and when its ringing is over.
 
     Returns whether there is anything to learn from.
     """

@@ -21,8 +21,9 @@ _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
 _POLES = "gate_threshold high_pass_pole mean_square_pole hold decay scale_pole levelling_pole power_pole"
 # the reference's fade, the drive's largest need and for how long it is held, scale; the finger's lever arm, contact,
-# samples since it changed and without a position; the gate's slow part, mean square and noise; r as the sensors should
-# show it; levelling force; mean squares on the untouched device, see `update_powers`; last sane sample of the waveform
+# samples since it changed and without a position (`away`; below 0: until the report of a suspected contact is due);
+# the gate's slow part, mean square and noise; r as the sensors should show it; levelling force; mean squares on the
+# untouched device, see `update_powers`; last sane sample of the waveform
 _STATE = """
 fade peak hold_left scale smooth_scale lever contact since away slow power sensed_noise reference moment
 nominal_power learned_power reference_power last_waveform
@@ -39,7 +40,7 @@ INVERSE = np.dtype(
         ("pole_step", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
-        ("noise", np.float64, (2,)),  # of heave and rocking: first part of sigma_e^2
+        ("noise", np.float64, (2,)),  # variances of heave and rocking: 6 (sensor noise)^2, first part of sigma_e^2
         ("model_error", np.float64),  # part of `model_power` in sigma_e^2
         ("prior", np.float64, (ROWS - 1,)),  # mean
         ("prior_covariance", np.float64, (ROWS - 1, ROWS - 1)),

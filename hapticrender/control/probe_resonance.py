@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.control.probe import TRIES, play_probe
+from hapticrender.control.probe import MOST_INVALID, TRIES, play_probe
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Driver
 
@@ -32,8 +32,10 @@ def probe_resonance(driver: Driver, mode: Any) -> None:
     mode, fault = mode.sampled(driver.rate), ""
     drive = resonance_drive(mode)
     for _ in range(TRIES):
-        sensed = play_probe(driver, drive[:, None], 1, REST)[0][: len(drive), 0]
-        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed)
+        sensed, lost = play_probe(driver, drive[:, None], 1, REST)
+        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed[: len(drive), 0])
+        if fault and lost > MOST_INVALID:
+            fault = f"{lost:.0%} of the samples were lost on the way: the probe cannot judge"
         if not fault:
             return
     cure = "check the wiring, or [device]; [render] probe = false leaves the probe out"
