@@ -192,11 +192,13 @@ static void restart_regressors(law_t *law)
     }
 }
 
-/* Set the device's own parameters back to the earlier note: a contact is reported after it happened. */
+/*
+ * Set the device's own parameters, whose covariance with others is that of the prior, back to the earlier note: a
+ * contact is reported after it happened.
+ */
 static void restore_device(law_t *law)
 {
     learning_t *v = &law->learning;
-    learning_reset(law, LAW_HEAVE, LAW_LOAD);
     (void)memcpy(v->earlier[1], v->earlier[0], sizeof(v->earlier[1]));
     for (uint32_t i = 0u; i < LAW_OWN; i++) {
         v->theta[LAW_HEAVE + i] = v->earlier[0][LAW_OWN][i];
@@ -265,6 +267,7 @@ uint32_t learning_follow_contact(law_t *law)
     if ((suspected != 0u) && (touching != 0u)) { /* what was learned of the finger stays */
         v->since = 0u;
         law->fast_timer = d->damper_time;
+        learning_reset(law, LAW_HEAVE, LAW_LOAD);
         restore_device(law);
     }
     const int32_t most = (suspected != 0u) ? 0 : (int32_t)d->loss_time;
