@@ -104,7 +104,6 @@ class Player(Addressed):
     ) -> None:
         if watchdog not in (None, math.inf):
             watchdog = number("watchdog", watchdog, "s", least=2.0 * SERVICE, most=LONGEST_WATCHDOG)
-        flag("paced", paced)
         if "texture" in tables:
             raise TypeError("texture: a player has none of its own: call play(texture)")
         if tables.get("touch_panel"):
@@ -116,7 +115,7 @@ class Player(Addressed):
         else:
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
-        self._driver, self._paced, self._watchdog = driver, paced, watchdog
+        self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when

@@ -220,8 +220,8 @@ def _suite(arguments: argparse.Namespace) -> int:
         named = {text: [case for case in cases if text in case] for text in arguments.scenes}
         if unknown := [text for text, found in named.items() if not found]:
             raise ValueError(f"{unknown}: must be names of cases, or parts of them; there are {', '.join(cases)}")
-        wanted = {case for text, found in named.items() for case in ([text] if text in found else found)}
-        cases = tuple(case for case in cases if case in wanted)
+        chosen_cases = {case for text, found in named.items() for case in ([text] if text in found else found)}
+        cases = tuple(case for case in cases if case in chosen_cases)
     with naming_driver(arguments.driver):
         figures = run_suite(methods, cases, lambda line: print(line, file=sys.stderr), **bench)
     print(table(as_rows(figures, methods)))

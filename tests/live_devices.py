@@ -122,3 +122,12 @@ class Blind(SimulatedDriver):
 
     def _play(self, drive):
         return super()._play(drive)._replace(position=None, normal_load=None)
+
+
+def error_of(recording, start, stop=None):
+    """Waveform error of a part of a recording in which the texture lies above 40 Hz, its mean removed."""
+    rate = recording.rate
+    first, last = round(start * rate), None if stop is None else round(stop * rate)
+    wanted, moved = recording.reference[first:last], recording.motion[first:last, 0]
+    wanted, moved = wanted - wanted.mean(), moved - moved.mean()
+    return float(np.sqrt(np.mean((moved - wanted) ** 2) / np.mean(wanted**2)))

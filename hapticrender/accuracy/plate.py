@@ -40,7 +40,7 @@ PLACES = (0.0, 15e-3, 27.5e-3)  # m
 SLIDING = Finger(Path(sliding), 0.8, ((1.0, 1000.0),), HEAVY)
 FINGER, ENDS, CENTRE = 0, [1, 2], 3  # columns of the truth
 EVERY = [FINGER, *ENDS]
-BENT = PlateParameters(bending_frequency=2000.0, bending_damping=1 / 60)  # no design is told of the mode
+BENT = PlateParameters(bending_frequency=2000.0, bending_damping=1 / 60)  # no design has the mode
 FACTORS = {"mass": 0.95, "inertia": 0.95, "stiffness_1": 1.05, "stiffness_2": 1.05, "damping_1": 0.8, "damping_2": 0.8}
 WRONG: dict[str, Any] = {name: factor * getattr(BENT, name) for name, factor in FACTORS.items()}
 WRONG |= {"sensor_gain_1": 1.02, "sensor_gain_2": 0.98, "delay": 2}
@@ -92,7 +92,7 @@ class Run(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """A method and the plate it plays on, of which it is told `delay` (samples; by default what a block takes).
+    """A method and the plate it plays on, of which the design has `delay` (samples; by default what a block takes).
 
     ``make(parameters, finger, seed=, block=, delay=)`` returns a driver with ``truth``, see `SimulatedPlate`.
     """
@@ -104,10 +104,10 @@ class Bench:
     delay: int = 0
     seed: int = 1
 
-    def of(self, block: int = 1, told: int = 0, **plate: Any) -> Bench:
+    def of(self, block: int = 1, stated: int = 0, **plate: Any) -> Bench:
         """Return the same bench with a plate that differs, or in blocks."""
         changed = replace(self.plate, **{"delay": block, **plate})
-        return replace(self, plate=changed, block=block, delay=told)
+        return replace(self, plate=changed, block=block, delay=stated)
 
     def driver(self, finger: Finger, seed: int) -> Any:
         """Make the plate."""
@@ -301,7 +301,7 @@ def modulation(bench: Bench) -> dict[str, float]:
 
 def late(bench: Bench) -> dict[str, float]:
     """A known delay of 60 ms: mean of tones from 8 s on, on the free plate, at the centre."""
-    slow = bench.of(delay=300, told=300, **RIGID)
+    slow = bench.of(delay=300, stated=300, **RIGID)
     found = [slow.play(bench.tone(each), 12.0).mean(each, 8.0)[CENTRE] for each in FREQUENCIES]
     return {"error": float(abs(amplitude_error(found, AMPLITUDE)).max())}
 
@@ -352,7 +352,7 @@ def in_blocks(
 
 CASES: dict[str, Case] = {
     "white": noise,
-    "white wrong": lambda bench: noise(bench.of(told=2, **WRONG)),
+    "white wrong": lambda bench: noise(bench.of(stated=2, **WRONG)),
     "white 48 kHz": in_blocks(noise, 64, 48e3),
     "waves": waves,
     "random fingers": random,
