@@ -57,6 +57,7 @@ def test_where_the_baselines_fail(case):
 def test_the_papers_method_misses_and_the_report_says_so(tmp_path):
     figures = run_suite(["paper"], ["sweeps"])
     assert len(missed(figures)) == 4
+    assert np.isfinite([each.value for each in figures]).all(), "a case that breaks is no miss"
     write_json(tmp_path / "a.json", figures)
     report = json.loads((tmp_path / "a.json").read_text(encoding="utf-8"))
     assert [row["passed"] for row in report["figures"]] == [False] * 4
