@@ -5,6 +5,7 @@
 
 #define FARTHEST_LEVER REAL(2.0) /* no surface is longer */
 #define UNREPORTED REAL(15e3)    /* N/m, of the coupling, for a finger whose place is not known yet: 12 N s/m or 10 g */
+#define INNOVATIONS REAL(10.0)   /* weight of their mean square in `model_power`: a tenth of it is noise */
 #define LONG_AGO 1000000000u     /* samples since the contact of a law at rest */
 #ifdef REAL_DOUBLE
 #define TERMS 10u                /* of the series of the exponential, whose rest is below a rounding: 0.5^11/11! */
@@ -370,9 +371,10 @@ void learning_update(law_t *law, const real_t error[2])
                 gain[1][i] -= share * gain[0][i];
             }
         }
-        v->model_power[c] += d->mean_square_pole * (error[c] * error[c] + explained * explained - v->model_power[c]);
-        const real_t scatter = d->noise[c] + d->model_error * v->model_power[c] + dot(gain[c], states, first, end);
         const real_t innovation = error[c] - explained + dot(states, v->theta, first, end);
+        const real_t square = explained * explained + INNOVATIONS * innovation * innovation;
+        v->model_power[c] += d->mean_square_pole * (square - v->model_power[c]);
+        const real_t scatter = d->noise[c] + d->model_error * v->model_power[c] + dot(gain[c], states, first, end);
         precision[c] = REAL(1.0) / scatter;
         for (uint32_t i = first; i < end; i++) {
             v->theta[i] -= gain[c][i] * precision[c] * innovation;

@@ -51,7 +51,7 @@ INVERSE = np.dtype(
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
         ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
         ("sensor_window", np.float64, (TAPS,)),  # around now, for what the sensors should show
-        ("model_power", np.float64, (2,)),  # mean squares of the deviation and of what the drive explains of it
+        ("model_power", np.float64, (2,)),  # mean squares of what the drive explains, and ten times of the innovations
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),
         ("theta", np.float64, (ROWS - 1,)),
