@@ -11,7 +11,7 @@ import pytest
 from hapticrender import second_core
 from hapticrender.plants.plate_kernels import FUNCTIONS
 
-SCRIPT = """
+START = """
 import numpy as np
 from hapticrender import second_core
 from hapticrender.plants.plate_kernels import FUNCTIONS, times
@@ -19,6 +19,8 @@ from hapticrender.plants.plate_kernels import FUNCTIONS, times
 for function in FUNCTIONS.values():
     function.expect()
 assert times.address
+"""
+SCRIPT = """
 (child,) = set(second_core.CHILDREN.values())
 assert len(second_core.CHILDREN) == len(FUNCTIONS) - 1 and not second_core.EXPECTED
 assert all(function.address for function in FUNCTIONS.values())
@@ -29,22 +31,31 @@ print("child", child.returncode)
 """
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core: there is no child")
+two_cores = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core: there is no child")
+ENDLESS = "second_core.CODE, second_core.PATIENCE = 'while True: pass', 0.0"
+
+
+def lines_of(script, cache, change=""):
+    """Lines that a script prints in a process of its own, with a folder for its cache, and what numba says of it."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "NUMBA_DEBUG_CACHE": "1"}
+    command = [sys.executable, "-c", START.format(change=change) + script]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert found.returncode == 0, found.stderr
+    return found.stdout.splitlines()
+
+
+@two_cores
 @pytest.mark.parametrize(
     ("change", "ended"),
     [
         ("", True),
         ("second_core.CODE = 'raise SystemExit(1)'", False),
-        ("second_core.CODE, second_core.PATIENCE = 'while True: pass', 0.0", False),
+        (ENDLESS, False),
     ],
     ids=["it works", "it fails", "it hangs"],
 )
 def test_what_a_child_does_not_compile_is_compiled_here(tmp_path, change, ended):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_DEBUG_CACHE": "1"}
-    command = [sys.executable, "-c", SCRIPT.format(change=change)]
-    found = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert found.returncode == 0, found.stderr
-    lines = found.stdout.splitlines()
+    lines = lines_of(SCRIPT, tmp_path, change)
     here, loaded = (
         {name for name in FUNCTIONS for line in lines if f"[cache] data {done}" in line and f".{name}_" in line}
         for done in ("saved to", "loaded from")
@@ -52,6 +63,16 @@ def test_what_a_child_does_not_compile_is_compiled_here(tmp_path, change, ended)
     assert (lines[-1] == "child 0") == ended
     assert here == ({"times"} if ended else set(FUNCTIONS))
     assert loaded == set(FUNCTIONS) - here
+    if ended:  # what is in the cache needs no child
+        lines_of("assert not second_core.CHILDREN", tmp_path)
+
+
+@two_cores
+@pytest.mark.skipif(os.name == "nt", reason="no signal 0 on Windows: nothing shows whether a process is there")
+def test_a_child_does_not_outlive_its_parent(tmp_path):
+    pid = int(lines_of("print(next(iter(second_core.CHILDREN.values())).pid)", tmp_path, ENDLESS)[-1])
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
 
 
 def started(_=None):
