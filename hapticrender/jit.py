@@ -26,6 +26,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from hapticrender.second_core import expect, shared
+
 # no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of
 # a part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
@@ -110,11 +112,17 @@ class CFunction:
         note.daemon = True
         note.start()
         try:
-            return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
+            with shared(self.function):
+                return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
         except RuntimeError:
             return numba.cfunc(self.signature, **OPTIONS)(self.function)
         finally:
             note.cancel()
+
+    def expect(self) -> None:
+        """Announce that the address is needed soon, for it to be compiled beside what is needed before."""
+        if "_compiled" not in self.__dict__:
+            expect(self.function)
 
     @property
     def address(self) -> int:

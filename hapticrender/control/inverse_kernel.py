@@ -284,7 +284,7 @@ def inverse_step(state, signals, start, count):
         error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0
         if update_confidence(state, implausible):
-            reset_parameters(inverse, 0, PARAMETERS)
+            reset_parameters(inverse, FINGER, PARAMETERS)
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
                 error0, error1 = c.past[0, (c.sample - 1) & PAST_MASK], c.past[1, (c.sample - 1) & PAST_MASK]

@@ -137,6 +137,7 @@ class SupervisedController(Addressed):
     def __init__(self, controller: Any, model: DeviceModel) -> None:
         self.controller, self.method, self.n_bands = controller, controller.method, controller.n_bands
         self.state = np.zeros(1, SUPERVISOR)
+        supervised_step.expect()
         self._forces = np.zeros((model.delay + 1, 3))
         settings = design_supervisor(controller, model)
         found = design_gains(model, sensor_noise(model)) if settings.get("modelled") else None

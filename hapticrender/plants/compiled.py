@@ -77,6 +77,7 @@ class CompiledPlant:
         self._samples = 0
         self._random = np.random.default_rng([seed, 2])  # a texture may be drawn from the same seed
         self._last = np.zeros((block, self.drive_channels))
+        self.step.expect()
 
     def inputs(self, first: int, n: int) -> Array:
         """Position (m), load (N), strength and speed (m/s) of the finger, sample by sample, shape (n, >= 4)."""

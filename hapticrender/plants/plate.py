@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -243,10 +244,15 @@ class Plate(CompiledPlant):
     def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         self.drive_channels = parameters.coils
         super().__init__(finger, parameters.rate, delay=parameters.delay, block=block, seed=seed)
-        self.parameters = parameters
-        queue = np.zeros((self.delay - block, parameters.coils))
-        self.buffers = (queue,)
-        self.state = _record(parameters, finger.mechanics, queue)
+        self.parameters, self._mechanics = parameters, finger.mechanics
+        self.buffers = (np.zeros((self.delay - block, parameters.coils)),)
+        for function in FUNCTIONS.values():
+            function.expect()
+
+    @cached_property
+    def state(self) -> Array:  # type: ignore[override]
+        """Record of the step, made with the first sample: its compiled functions are expected until then."""
+        return _record(self.parameters, self._mechanics, *self.buffers)
 
     def inputs(self, first: int, n: int) -> Array:
         """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""

@@ -20,6 +20,7 @@ The functions of this file call each other by address: each is compiled once, in
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numba
 import numpy as np
@@ -93,7 +94,8 @@ def bending_shape(s, lever):
     return s.shape[1] * math.cosh(x) + s.shape[2] * math.cos(x)
 
 
-def _times(matrix, w, out):
+@partial(CFunction, signature=I8(I8, I8, I8))
+def times(matrix, w, out):
     """Multiply a matrix (11 columns of 8) by a vector (11,), all given by address."""
     m, u, y = carray(pointer(matrix, F8), (COLUMNS, STATES)), carray(pointer(w, F8), COLUMNS), pointer(out, F8)
     u0, u1, u2, u3, u4, u5, u6, u7, u8, u9, u10 = u[0], u[1], u[2], u[3], u[4], u[5], u[6], u[7], u[8], u[9], u[10]
@@ -104,7 +106,8 @@ def _times(matrix, w, out):
     return 0
 
 
-def _assemble(state, lever, strength):
+@partial(CFunction, signature=I8(I8, F8, F8))
+def assemble(state, lever, strength):
     """Fill [A B] for a finger at a lever arm; the mass matrix is inverted by the formula of Sherman and Morrison."""
     s = carray(pointer(state, PLATE_T), 1)[0]
     h, f, w, d, own = s.glass, s.tissue, s.moved, s.inverse_mass, s.force
@@ -130,7 +133,8 @@ def _assemble(state, lever, strength):
     return 0
 
 
-def _sum_series(state):
+@partial(CFunction, signature=I8(I8))
+def sum_series(state):
     """Add (1 + A/2! + A^2/3! + ...) term to `total`, to rounding."""
     s = carray(pointer(state, PLATE_T), 1)[0]
     scale = 0.0
@@ -149,7 +153,8 @@ def _sum_series(state):
     return 0
 
 
-def _fill(state, node, lever, strength):
+@partial(CFunction, signature=I8(I8, I8, F8, F8))
+def fill(state, node, lever, strength):
     """Compute [Phi Gamma] for a lever arm and a strength as entry `node` of the table."""
     s = carray(pointer(state, PLATE_T), 1)[0]
     call(s.assemble, (state, lever, strength))
@@ -163,7 +168,8 @@ def _fill(state, node, lever, strength):
     return 0
 
 
-def _slide(state, lever, strength):
+@partial(CFunction, signature=I8(I8, F8, F8))
+def slide(state, lever, strength):
     """Advance the states by the table, interpolated at a lever arm."""
     s = carray(pointer(state, PLATE_T), 1)[0]
     place = lever * s.nodes_per_lever
@@ -181,7 +187,8 @@ def _slide(state, lever, strength):
     return 0
 
 
-def _advance(state, lever, strength):
+@partial(CFunction, signature=I8(I8, F8, F8))
+def advance(state, lever, strength):
     """Advance the states by one sample under the inputs in `w`."""
     s = carray(pointer(state, PLATE_T), 1)[0]
     same = strength == s.strength
@@ -204,14 +211,8 @@ def _advance(state, lever, strength):
     return 0
 
 
-FUNCTIONS = {  # by their fields in `PLATE`
-    "times": CFunction(_times, I8(I8, I8, I8)),
-    "assemble": CFunction(_assemble, I8(I8, F8, F8)),
-    "sum_series": CFunction(_sum_series, I8(I8)),
-    "fill": CFunction(_fill, I8(I8, I8, F8, F8)),
-    "slide": CFunction(_slide, I8(I8, F8, F8)),
-    "advance": CFunction(_advance, I8(I8, F8, F8)),
-}
+FUNCTIONS = {f.function.__name__: f for f in (times, assemble, sum_series, fill, slide, advance)}
+"""By their fields in `PLATE`."""
 
 
 @step

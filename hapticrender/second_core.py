@@ -1,0 +1,83 @@
+"""Compile on two cores: a child process compiles into numba's cache what this process needs next.
+
+numba compiles one function at a time.  Whoever will need a C function of this library soon announces it by `expect`.
+As soon as numba compiles a part of another one (it loads from its cache without that event) a child process starts on
+all that is expected; `shared` waits for it where one of them is needed, and loads that from the cache.  Whatever
+becomes of the child (killed, no right to write, no second core), what is not in the cache is compiled here.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from numba.core.event import Listener, install_listener
+
+PATIENCE = 60.0  # s that a child may take
+EXPECTED: set[tuple[str, str]] = set()  # module and name
+CHILDREN: dict[tuple[str, str], Any] = {}  # those that a child process compiles, and the process
+CODE = """
+import sys
+sys.path[:] = {path!r}
+from importlib import import_module
+for module, name in {names!r}:
+    getattr(import_module(module), name).address
+"""
+
+
+def expect(*functions: Callable[..., Any]) -> None:
+    """Announce functions of modules of this library, in which a `CFunction` has their name: they are needed soon."""
+    EXPECTED.update((f.__module__, f.__name__) for f in functions if f.__module__.startswith("hapticrender."))
+
+
+@contextmanager
+def shared(function: Callable[..., Any]) -> Iterator[None]:
+    """Wait for the child that compiles this function, if there is one; while it compiles here, start one on the others.
+
+    The cache is used inside, as the child's work is of no use without it.
+    """
+    name = (function.__module__, function.__name__)
+    EXPECTED.discard(name)
+    if child := CHILDREN.pop(name, None):
+        end(child, PATIENCE)
+    with install_listener("numba:compile", Starter()):
+        yield
+
+
+class Starter(Listener):
+    """Starts the child where numba compiles something."""
+
+    def on_start(self, event: Any) -> None:
+        """Start a child on what is expected; there is none in one of many processes, which would start as many."""
+        import multiprocessing
+        import subprocess
+
+        names = sorted(EXPECTED)
+        python = Path(sys.executable or "").name.lower().startswith("python")  # else a program with Python inside
+        if not names or not python or multiprocessing.parent_process() or (os.cpu_count() or 1) < 2:
+            return
+        EXPECTED.clear()
+        command, silent = [sys.executable, "-c", CODE.format(path=sys.path, names=names)], subprocess.DEVNULL
+        with suppress(OSError):  # no process to be had
+            child = subprocess.Popen(command, stdin=silent, stdout=silent, stderr=silent)
+            CHILDREN.update(dict.fromkeys(names, child))
+            atexit.register(end, child, 0.0)
+
+    def on_end(self, event: Any) -> None:
+        """Nothing is left to do."""
+
+
+def end(child: Any, patience: float) -> None:
+    """Wait for a child process, and kill it where it takes too long."""
+    import subprocess
+
+    try:
+        child.wait(patience)
+    except subprocess.TimeoutExpired:
+        child.kill()
+        child.wait()

@@ -1,0 +1,114 @@
+"""Compilation on two cores: what the child compiled is loaded, and whatever becomes of the child is made up for."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from concurrent.futures import ProcessPoolExecutor
+
+import pytest
+
+from hapticrender import second_core
+from hapticrender.plants.plate_kernels import FUNCTIONS
+
+START = """
+import numpy as np
+from hapticrender import second_core
+from hapticrender.plants.plate_kernels import FUNCTIONS, times
+{change}
+for function in FUNCTIONS.values():
+    function.expect()
+assert times.address
+"""
+SCRIPT = """
+(child,) = set(second_core.CHILDREN.values())
+assert len(second_core.CHILDREN) == len(FUNCTIONS) - 1 and not second_core.EXPECTED
+assert all(function.address for function in FUNCTIONS.values())
+matrix, w, product = np.arange(88.0), np.ones(11), np.zeros(8)
+times(matrix.ctypes.data, w.ctypes.data, product.ctypes.data)
+assert np.array_equal(product, matrix.reshape(11, 8).sum(axis=0))
+print("child", child.returncode)
+"""
+
+
+two_cores = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core: there is no child")
+ENDLESS = "second_core.CODE, second_core.PATIENCE = 'while True: pass', 0.0"
+
+
+def lines_of(script, cache, change=""):
+    """Lines that a script prints in a process of its own, with a folder for its cache, and what numba says of it."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "NUMBA_DEBUG_CACHE": "1"}
+    command = [sys.executable, "-c", START.format(change=change) + script]
+    found = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert found.returncode == 0, found.stderr
+    return found.stdout.splitlines()
+
+
+@two_cores
+@pytest.mark.parametrize(
+    ("change", "ended"),
+    [
+        ("", True),
+        ("second_core.CODE = 'raise SystemExit(1)'", False),
+        (ENDLESS, False),
+    ],
+    ids=["it works", "it fails", "it hangs"],
+)
+def test_what_a_child_does_not_compile_is_compiled_here(tmp_path, change, ended):
+    lines = lines_of(SCRIPT, tmp_path, change)
+    here, loaded = (
+        {name for name in FUNCTIONS for line in lines if f"[cache] data {done}" in line and f".{name}_" in line}
+        for done in ("saved to", "loaded from")
+    )
+    assert (lines[-1] == "child 0") == ended
+    assert here == ({"times"} if ended else set(FUNCTIONS))
+    assert loaded == set(FUNCTIONS) - here
+    if ended:  # what is in the cache needs no child
+        lines_of("assert not second_core.CHILDREN", tmp_path)
+
+
+@two_cores
+@pytest.mark.skipif(os.name == "nt", reason="no signal 0 on Windows: nothing shows whether a process is there")
+def test_a_child_does_not_outlive_its_parent(tmp_path):
+    pid = int(lines_of("print(next(iter(second_core.CHILDREN.values())).pid)", tmp_path, ENDLESS)[-1])
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+def started(_=None):
+    """Whether a child would be started here for a function that is expected; it is not waited for."""
+    second_core.EXPECTED.add(("math", "sin"))  # has no address: the child fails
+    second_core.Starter().on_start(None)
+    child = second_core.CHILDREN.pop(("math", "sin"), None)
+    second_core.EXPECTED.clear()
+    if child:
+        second_core.end(child, 60.0)
+    return child is not None
+
+
+@pytest.fixture
+def nothing_expected(monkeypatch):
+    monkeypatch.setattr(second_core, "EXPECTED", set())
+    monkeypatch.setattr(second_core, "CHILDREN", {})
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+
+
+def test_no_child_without_a_second_core_or_an_interpreter(nothing_expected, monkeypatch, tmp_path):
+    assert started()
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    assert not started()
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    for executable in (None, "", str(tmp_path / "blender"), str(tmp_path / "python-that-is-not-there")):
+        monkeypatch.setattr(sys, "executable", executable)
+        assert not started()
+
+
+def test_no_child_of_one_of_many_processes():
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        assert not any(pool.map(started, range(2)))
+
+
+def test_only_this_librarys_functions_are_expected(nothing_expected):
+    """Another module may do anything when it is imported."""
+    second_core.expect(started, FUNCTIONS["fill"].function)
+    assert second_core.EXPECTED == {("hapticrender.plants.plate_kernels", "fill")}
