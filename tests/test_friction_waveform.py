@@ -117,7 +117,7 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(16, 0.8) if tells else None
     device = watched(heavy, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
     recording = hr.render(
-        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.5, settle=0.2), driver=device
+        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.42, settle=0.2), driver=device
     )
     assert least < friction_of(np.concatenate(device.moved)[:, 0], 200.0, load=0.8) / (10e-3 / 0.64) < most
     assert recording.summary()["verdict"] != "passed"
