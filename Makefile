@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs clean
+.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -13,7 +13,7 @@ OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
 # Tests that play in real time run first, one after the other; the rest on two cores.
-REAL_TIME := $(wildcard tests/test_audio*.py tests/test_player*.py tests/test_board_live.py)
+REAL_TIME := tests/test_audio_jack.py $(wildcard tests/test_player*.py) tests/test_board_live.py
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
 	nu32.py player_board.py)
@@ -66,6 +66,9 @@ docs: .venv/docs.stamp ## build the API reference from the docstrings into out/a
 	@$(RUN) -W error::UserWarning -W "ignore:Error parsing type annotation" -m pdoc -d numpy -o out/api $(API)
 	@echo "API reference: out/api/index.html"
 
+wheel: .venv/test.stamp ## build the wheel, install it into an empty environment and run the demo there
+	@.ci/wheel
+
 clean: ## remove the environment and everything that was built or written
 	@rm -rf .venv .venv-oldest build dist out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
@@ -92,10 +95,10 @@ clean: ## remove the environment and everything that was built or written
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test]'
 	@touch $@ .venv/demo.stamp
 
-.venv/bench.stamp: .venv/test.stamp
-	@echo "installing what the benchmarks compare with into .venv"
+.venv/bench.stamp: .venv/made.stamp pyproject.toml
+	@echo "installing what tests need and benchmarks compare with into .venv"
 	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test,bench]'
-	@touch $@
+	@touch $@ .venv/test.stamp .venv/demo.stamp
 
 .venv/docs.stamp: .venv/demo.stamp
 	@echo "installing pdoc into .venv"

@@ -102,8 +102,8 @@ def test_a_grating_holds_under_the_recorded_finger(shared_data):
 
 
 def test_no_limit_cycle_under_random_fingers(rng):
-    """12 of 24 random fingers come to rest, and peak below the worst of them, 32 %."""
-    log = [rng.uniform(np.log(low), np.log(high), 24)[:12] for low, high in RANGES]
+    """6 of 24 random fingers come to rest, and peak below the worst of them, 32 %."""
+    log = [rng.uniform(np.log(low), np.log(high), 24)[:6] for low, high in RANGES]
     names = ("mass", "damping", "stiffness", "phalanx_mass", "phalanx_damping", "phalanx_stiffness")
     fingers = [(FingerMechanics(order=4, **dict(zip(names, row, strict=True))), 0.8) for row in np.exp(log).T]
     found = plate.touch(plate.Bench(method=defaults.METHOD).of(**plate.RIGID), fingers=fingers, at=(15e-3,))

@@ -69,8 +69,14 @@ def assert_stopped(plate, frequency, named, latest, most):
     assert not drive[quiet:].any()
 
 
-@pytest.mark.parametrize("truth", [{}, FINGER], ids=["free", "touched"])
-@pytest.mark.parametrize("frequency", [72.0, 189.0])
+TUNED = pytest.mark.parametrize(
+    ("frequency", "truth"),
+    [(72.0, {}), (189.0, FINGER), (189.0, {})],
+    ids=["72 free", "189 touched", "189 free"],
+)
+
+
+@TUNED
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_sensor_that_lies_stops_the_drive_and_is_named(fault, frequency, truth):
     """Zero drive within 10 ms of the fault: 2 ms are the fade."""
@@ -120,7 +126,7 @@ def test_a_compiled_loop_stops_too():
 # m: F/k, what the least of the three scenes' limits of drive (1.07 A, 7.4 N/A on two coils, 45.3 kN/m) holds at rest;
 # a limit that reverses once moves the plate from there to 3 F/k on the other side
 HELD = 2 * 7.4 * 1.07 / 45.3e3
-CHANGES = {  # sensors and coils from 0.5 s on: bounds of time (s) and motion (m), and what is named
+CHANGES = {  # sensors and coils from `START` on: bounds of time (s) and motion (m), and what is named
     "sensors inverted": (-np.eye(2), np.eye(2), 8e-3, HELD, "sensor 1 and 2: the samples are suddenly -"),
     "sensor inverted": (np.diag([1.0, -1.0]), np.eye(2), 8e-3, HELD, "sensor 2: the samples are suddenly -"),
     "gain of 3": (3.0 * np.eye(2), np.eye(2), 8e-3, 100e-6, "sensor 1 and 2: the samples are suddenly (2|3)"),
@@ -142,13 +148,6 @@ class Rewired(Watched):
         if len(self.played) == self.start * RATE:
             self._gamma = self._gamma @ self.late_coils
         return super().play(drive)
-
-
-TUNED = pytest.mark.parametrize(
-    ("frequency", "truth"),
-    [(72.0, {}), (189.0, FINGER), (189.0, {})],
-    ids=["72 free", "189 touched", "189 free"],
-)
 
 
 @TUNED

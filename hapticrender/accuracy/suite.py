@@ -83,7 +83,7 @@ PLATES: tuple[
     ("touch", "the same, at 0, 15 and 27.5 mm", "%", {"finger": (22, 12)}),
     ("touch", "the same: centre back within 5 %", "ms", {"back": (50, 25)}),
     ("touch", "the same: left after 0.6 s (a limit cycle would show)", "%", {"left": (5, 1)}),
-    ("touch rigid", "the same, rigid plate", "%", {"centre": (9, 6), "end": (22, 12)}),
+    ("touch rigid", "the same, rigid plate, heavy fingers", "%", {"centre": (9, 6), "end": (22, 12)}),
     ("touch wrong", "the same, rigid, wrong in everything", "%", {"centre": (11, 11), "end": (22, 22)}),
     ("touch blocks", "touch, rigid plate, blocks of 25 at 5 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),
     ("touch 48 kHz", "touch, rigid plate, blocks of 64 at 48 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),

@@ -135,12 +135,12 @@ class Header(Validated):
             "target": [(f"target {k} {part}", self.unit) for k, part in parts],
         }
 
-    @property
+    @cached_property
     def widths(self) -> dict[str, int]:
         """Number of columns of each signal."""
         return {name: len(columns) for name, columns in self.columns.items()}
 
-    @property
+    @cached_property
     def slices(self) -> dict[str, slice]:
         """Columns of each signal."""
         ends = np.cumsum(list(self.widths.values())).tolist()
@@ -152,7 +152,7 @@ class Header(Validated):
         units = tuple(self.drive_unit.split(", "))
         return units if len(units) == self.drive_channels else (self.drive_unit,) * self.drive_channels
 
-    @property
+    @cached_property
     def channels(self) -> list[tuple[str, str]]:
         """Name and unit of every column."""
         return [*itertools.chain(*self.columns.values())]
