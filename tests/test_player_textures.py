@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_devices import RIDGES, TONE, Calling, Lying, error_of, slide
+from live_devices import RIDGES, TONE, Lying, error_of, slide
 
 import hapticrender as hr
 from hapticrender import sampled_texture
@@ -182,12 +182,6 @@ def test_a_playlist_along_the_surface_plays_beside_a_tone_and_within_another():
             (row,) = player.state().bands
             assert row.target > 0.9 * 5e-6 / np.sqrt(2)
             assert row.error < WORST
-
-
-def test_a_texture_in_time_and_place_at_once_is_refused_where_a_callback_has_no_python():
-    refusal = pytest.raises(ValueError, match="Own: must not change with .* contact on a sound card or a board, or a")
-    with hr.Player(driver=Calling()) as player, refusal:
-        player.play(MOVING)
 
 
 def test_what_plays_goes_on_while_a_texture_is_prepared(tmp_path, monkeypatch):

@@ -23,8 +23,8 @@ from hapticrender.mathx import smoothstep
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
-from hapticrender.realtime_kernel import ENTRY, FRESH, HOLD, HORIZON, JUMP, MIDDLE_AT, publish, swap
-from hapticrender.sampled_texture import FADE, SampledTexture
+from hapticrender.realtime_kernel import ENTRY, HOLD, HORIZON, JUMP, MIDDLE_AT, swap
+from hapticrender.sampled_texture import FADE, FRESH, SampledTexture, publish
 
 RATE, BLOCK = 5000.0, 10
 PLAIN = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
@@ -307,7 +307,7 @@ def write(entry, slots, width, rounds):
     for i in range(1, rounds + 1):
         for j in range(width):
             table[back, j] = i
-        back = publish(entry, back)
+        back = publish(entry + MIDDLE_AT, back)
     return 0
 
 
