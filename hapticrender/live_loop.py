@@ -112,7 +112,7 @@ class LiveLoop(RealtimeEntry):
     def advance(self, sensing: bool, late: bool = False) -> None:
         """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one.
 
-        `late`: the device lost samples before it.
+        `late`: the device was left behind by the clock before it.
         """
         places, stated = len(self.model.places), self._has_motion
         sensed = check_sensed(self.driver, self.driver.play(self._drive), places, stated)

@@ -56,14 +56,15 @@ class LiveThreads:
 def hold_to_clock(loop: LiveLoop, play: Callable[[bool], None], stopping: threading.Event) -> None:
     """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
 
-    A real device has then lost samples, and `play` is called with True; a clock of its own may be off by `DRIFT`.
+    `play` is then called with True: a real device has lost samples, and a simulation is slower than the clock.  A real
+    device's own clock may be off by `DRIFT`.
     """
     rate, late = loop.driver.rate, False
     drift, real = DRIFT * loop.driver.block / rate, loop.rendering.plant is None
     play(False)  # the first one may open a stream
     start = time.monotonic() - loop.samples / rate
     while not stopping.is_set():
-        play(late and real)
+        play(late)
         ahead = loop.samples / rate - (time.monotonic() - start)
         late = ahead < -LATE
         start -= ahead if late else min(max(ahead, -drift), drift if real else 0.0)

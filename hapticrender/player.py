@@ -29,7 +29,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hapticrender.checks import flag, number
+from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
@@ -242,6 +242,7 @@ class Player(Addressed):
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
         with self._lock, self._busy():
             loop = self._playing("record")
+            require(isinstance(path, str | Path), "path", path, "the name of a journal, such as session.au", TypeError)
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
