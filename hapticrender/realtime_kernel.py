@@ -224,7 +224,7 @@ def play_texture(entry, slot):
             waveform[m] = gain * (before + present)
         gain, touch = gains[now % size, 0], gains[now % size, 1]
         log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, places[0, m], gain, touch)
-    if e.current != 0 and runs_out(e.current, e.samples + e.ahead):
+    if e.current != 0 and runs_out(e.current, e.samples + e.ahead, e.block):
         e.lost |= OVERRUN
     e.age += e.block
     e.taken += e.block

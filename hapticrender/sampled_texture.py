@@ -32,18 +32,19 @@ SLOTS, FRESH = 3, 4  # pieces; bit beside the number of the one in the middle: n
 
 TEXTURE = np.dtype(
     [
-        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "profile_at", "points", "control")),
-        *((name, np.int64) for name in ("follows", "evaluate", "pieces_at", "width", "middle", "slot")),
+        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "back", "profile_at", "points")),
+        *((name, np.int64) for name in ("control", "follows", "evaluate", "pieces_at", "width", "middle", "slot")),
         *((name, np.float64) for name in ("start", "spacing", "fade", "blend")),
     ]
 )
-"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on; the
-record of the controller that plays it (`realtime_kernel.CONTROL`); whether its samples are 0 while the finger is away.
-Function that evaluates a block of them; or pieces of `width` numbers: which sample is the first, then the samples."""
+"""Ring of samples, how many were ever written, the sample at which the texture began, the one from which on it fades in
+again after none was there; profile from `start` (m) on; the record of the controller that plays it
+(`realtime_kernel.CONTROL`); whether its samples are 0 while the finger is away.  Function that evaluates a block of
+them; or pieces of `width` numbers: which sample is the first, then the samples."""
 READER = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)
 TEXTURE_T = numba.from_dtype(TEXTURE)
 MIDDLE_AT = TEXTURE.fields["middle"][1] if TEXTURE.fields else 0
-FOREVER = 2**62  # samples: written in time, whenever they are read
+FOREVER = 2**61  # samples: longer than anything plays
 
 
 @entry
@@ -61,12 +62,14 @@ def smoothstep(x):
 
 @kernel
 def in_time(texture, sample):
-    """Its function of time, at a sample of the device's clock; fades out where nothing has been written yet."""
+    """Its function of time, at a sample of the device's clock; fades out where nothing is written yet, and back."""
     v = record(texture, TEXTURE_T, 0)
     k = sample - v.begun
     if v.length == 0 or k < 0 or k >= v.written:
         return 0.0
-    return smoothstep((v.written - k) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
+    return (
+        smoothstep(min(v.written - k, k - v.back) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
+    )
 
 
 @kernel
@@ -85,10 +88,17 @@ def along_surface(texture, position):
 
 
 @kernel
-def runs_out(texture, sample):
-    """Whether its function of time fades out at a sample, as no more has been written."""
+def runs_out(texture, sample, block):
+    """Whether its function of time fades out at the sample that begins a block, as no more has been written.
+
+    What is written meanwhile fades in from the next block on, from the share that is left by then.
+    """
     v = record(texture, TEXTURE_T, 0)
-    return v.length > 0 and v.written - (sample - v.begun) < v.fade
+    after = sample + block - v.begun
+    out = v.length > 0 and v.written - (sample - v.begun) < v.fade
+    if out and v.width == 0:
+        v.back = after - max(v.written - after, 0)
+    return out
 
 
 @kernel
@@ -130,7 +140,8 @@ class SampledTexture(Addressed):
         self._profile = self._parts.along_surface(places)
         arrays = {"samples_at": self._samples, "profile_at": self._profile}
         sizes = {"length": len(self._samples), "points": len(self._profile)}
-        self.record = record_of(TEXTURE, **arrays, **sizes, start=-REACH, spacing=STEP, fade=FADE * rate)
+        numbers = {"start": -REACH, "spacing": STEP, "fade": FADE * rate, "back": -FOREVER}
+        self.record = record_of(TEXTURE, **arrays, **sizes, **numbers)
         self.address = int(self.record.ctypes.data)
         self.fill(0)
 
@@ -175,7 +186,12 @@ class EvaluatedTexture(Addressed):
 
     def _describe(self, **values: Any) -> None:
         self.record = record_of(
-            TEXTURE, samples_at=self._samples, length=len(self._samples), follows=self._follows, **values
+            TEXTURE,
+            samples_at=self._samples,
+            length=len(self._samples),
+            back=-FOREVER,
+            follows=self._follows,
+            **values,
         )
         self.address = int(self.record.ctypes.data)
 
