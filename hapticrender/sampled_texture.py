@@ -27,7 +27,7 @@ AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is 
 CHUNK = 4096  # samples computed at once
 STEP, REACH = 2e-6, 0.15  # m: of the profile, and to either side of the surface's middle
 FADE = 0.04  # s: of one texture into another, and of what ends
-PIECE, BLEND = 0.1, 5e-3  # s: evaluated at once of a texture in time and place; in which it fades over the one before
+PIECE, BLEND = 0.2, 5e-3  # s: evaluated at once of a texture in time and place; in which it fades over the one before
 SLOTS, FRESH = 3, 4  # pieces; bit beside the number of the one in the middle: not yet read
 
 TEXTURE = np.dtype(
