@@ -131,8 +131,9 @@ def _add_checks(choices: Any) -> None:
     text = "instead of scenes: accuracy, all targets of the library, or the cases with SCENE in their names; "
     text += "--driver module:callable plays those of plates on yours (hapticrender.accuracy.plate.Bench)"
     validate.add_argument("--suite", metavar="NAME", choices=["accuracy"], help=text)
-    validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON")
-    validate.add_argument("--junit", metavar="FILE", type=_path, help="write the JUnit XML that CI systems read")
+    validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON; its folder is made")
+    text = "write the JUnit XML that CI systems read; its folder is made"
+    validate.add_argument("--junit", metavar="FILE", type=_path, help=text)
     text = "folder for the files of each scene that does not pass"
     validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
     validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")

@@ -24,13 +24,15 @@ from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
-from hapticrender.sampled_texture import FADE, EvaluatedTexture, SampledTexture
+from hapticrender.sampled_texture import FADE, EvaluatedTexture, ForeseenTexture, SampledTexture
 from hapticrender.touch.composed import InseparableTexture
 from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
 PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
+REFRESH = 0.02  # s: after which a texture in time and place is evaluated again while its finger goes on as it did
+CHANGES = "current", "previous", "finger_changes"  # of an entry: after which it is evaluated at once
 RIDGE = 1e-4  # of the samples: bands that the time cannot tell apart share what there is, and do not blow up
 LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 
@@ -93,6 +95,7 @@ class LiveLoop(RealtimeEntry):
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
         self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
         self._began = math.nan  # s: computing a piece of a texture
+        self._foreseen: tuple[int, tuple[int, ...]] = (0, ())  # sample and state of the last `foresee`
         self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
         self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
         self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
@@ -109,7 +112,7 @@ class LiveLoop(RealtimeEntry):
     def advance(self, sensing: bool, late: bool = False) -> None:
         """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one.
 
-        `late`: the device lost samples before it.
+        `late`: the device was left behind by the clock before it.
         """
         places, stated = len(self.model.places), self._has_motion
         sensed = check_sensed(self.driver, self.driver.play(self._drive), places, stated)
@@ -131,7 +134,8 @@ class LiveLoop(RealtimeEntry):
         """As `fill`, for `SPELL` at most; what is past by then is left out."""
         rate, ahead, until = self.driver.rate, sampled_texture.AHEAD, time.monotonic() + SPELL
         playing = [int(self._entry[name][0]) for name in ("current", "previous")]
-        for texture in [each for each in self._textures if each.address in playing and each.record["length"][0]]:
+        timed = [each for each in self._textures if isinstance(each, SampledTexture) and each.record["length"][0]]
+        for texture in [each for each in timed if each.address in playing]:
             while time.monotonic() < until:
                 now = self.samples + self.ahead - int(texture.record["begun"][0])
                 written = max(int(texture.record["written"][0]), now)
@@ -142,6 +146,25 @@ class LiveLoop(RealtimeEntry):
                 if self.samples + self.ahead - int(texture.record["begun"][0]) > written + PIECE * rate:
                     self.slow = self.computing
                 self._began = math.nan
+
+    def foresee(self) -> None:
+        """Evaluate what comes of textures in time and place, where it is due: the finger was set, or it runs out."""
+        playing = [each for each in self._textures if isinstance(each, ForeseenTexture)]
+        if not playing:
+            return
+        entry, path = self.foreseen(sampled_texture.PIECE)
+        sample, state = int(entry["samples"][0]), tuple(int(entry[name][0]) for name in CHANGES)
+        if state == self._foreseen[1] and sample < self._foreseen[0] + REFRESH * self.driver.rate:
+            return
+        self._foreseen = sample, state
+        for texture in playing:
+            if texture.address in state:
+                texture.foresee(sample, path)
+
+    @property
+    def evaluating(self) -> str:
+        """What to say of a texture in time and place that is being evaluated, and does not end."""
+        return f"{type(self.rendering.scene.texture).__name__}: its waveform has not returned: it was faded out"
 
     @property
     def computing(self) -> str:
@@ -249,7 +272,7 @@ class LiveLoop(RealtimeEntry):
             return SampledTexture(rendering.scene.texture, self.driver.rate, rendering.waveform_of)
         except InseparableTexture:
             if self._calls_back:  # by a callback without Python's lock
-                raise
+                return ForeseenTexture(rendering, self.ahead, self.foreseen(sampled_texture.PIECE)[1])
         return EvaluatedTexture(rendering, self.ahead, self._arrays["places"], self._arrays["position"])
 
 

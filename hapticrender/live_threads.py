@@ -11,6 +11,7 @@ from hapticrender.live_loop import LiveLoop
 
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
 DRIFT = 0.01  # of the clock
+FORESEE = 5e-3  # s between two looks at where the finger was set, for textures in time and place
 
 
 class LiveThreads:
@@ -28,7 +29,7 @@ class LiveThreads:
             except BaseException as error:
                 failed(error)
 
-        thread = threading.Thread(target=run, name=target.__name__.strip("_"), daemon=True)
+        thread = threading.Thread(target=run, daemon=True)
         thread.start()
         return thread
 
@@ -55,16 +56,26 @@ class LiveThreads:
 def hold_to_clock(loop: LiveLoop, play: Callable[[bool], None], stopping: threading.Event) -> None:
     """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
 
-    A real device has then lost samples, and `play` is called with True; a clock of its own may be off by `DRIFT`.
+    `play` is then called with True: a real device has lost samples, and a simulation is slower than the clock.  A real
+    device's own clock may be off by `DRIFT`.
     """
     rate, late = loop.driver.rate, False
     drift, real = DRIFT * loop.driver.block / rate, loop.rendering.plant is None
     play(False)  # the first one may open a stream
     start = time.monotonic() - loop.samples / rate
     while not stopping.is_set():
-        play(late and real)
+        play(late)
         ahead = loop.samples / rate - (time.monotonic() - start)
         late = ahead < -LATE
         start -= ahead if late else min(max(ahead, -drift), drift if real else 0.0)
         if ahead - drift > NAP:
             time.sleep(ahead - drift)
+
+
+def foresee(loop: LiveLoop, stopping: threading.Event) -> None:
+    """Evaluate textures in time and place ahead of a callback, in at most a quarter of the time."""
+    took = 0.0
+    while not stopping.wait(max(FORESEE, 3.0 * took)):
+        began = time.monotonic()
+        loop.foresee()
+        took = time.monotonic() - began

@@ -29,7 +29,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hapticrender.checks import flag, number
+from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
@@ -37,7 +37,7 @@ from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_playlist import LivePlaylist, parts_of
-from hapticrender.live_threads import LiveThreads, hold_to_clock
+from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
 from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
@@ -242,6 +242,7 @@ class Player(Addressed):
         """Keep everything from now on in a journal (.au), until `end_recording` or the end; the device must play."""
         with self._lock, self._busy():
             loop = self._playing("record")
+            require(isinstance(path, str | Path), "path", path, "the name of a journal, such as session.au", TypeError)
             if self._recorder is not None:
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
@@ -388,7 +389,9 @@ class Player(Addressed):
         elif own:
             loop.start()
         elif self._paced:
-            self._run(self._drive_device, device)
+            self._run(lambda: hold_to_clock(loop, self._block, self._stopping), device)
+        if calls_back:
+            self._run(lambda: foresee(loop, self._stopping), device, lambda: loop.evaluating)
         if self._paced:
             self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
         return renderings
@@ -406,9 +409,6 @@ class Player(Addressed):
                     play_zeros(loop.driver)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
-
-    def _drive_device(self) -> None:
-        hold_to_clock(self._playing("play"), self._block, self._stopping)
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""

@@ -26,7 +26,8 @@ class PlayerState:
     """What a player does: `time` (s played), bands over the last quarter of a second, and all flags so far.
 
     A texture that is a whole waveform has one band of frequency 0, whose amplitudes are rms.  `lost` counts callbacks
-    in which the device lost samples, `load` is the share of its time that a callback takes (NaN where unknown).
+    in which the device lost samples, and samples of a texture that were not computed in time; `load` is the share of
+    its time that a callback takes (NaN where unknown).
     """
 
     time: float

@@ -29,15 +29,26 @@ from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
-from hapticrender.realtime_kernel import AUDIO, CONTROL, ENTRY, HOLD, PLAIN, SLOT, publish
-from hapticrender.sampled_texture import FADE, EvaluatedTexture, SampledTexture
+from hapticrender.realtime_kernel import (
+    AUDIO,
+    CONTROL,
+    COPIES,
+    ENTRY,
+    ENTRY_WORDS,
+    HOLD,
+    MIDDLE_AT,
+    PLAIN,
+    SLOT,
+    WORDS,
+    foresee,
+)
+from hapticrender.sampled_texture import FADE, SLOTS, EvaluatedTexture, SampledTexture, publish
 
 TOUCH_FADE = 0.02  # s: of a function of position, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
 GAIN_TIME = 10e-3  # s
 CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers
 LOG_TIME = 2.0  # s: of signals that are kept
-SLOTS = 3
 BLOCK = ("sensed", "drive", "position", "waveform", "flags")  # signals of a block that all controllers share
 SAME = ("channels", "sensors", "block", "lookahead", "rate")  # of all controllers of an entry
 
@@ -121,6 +132,7 @@ class RealtimeEntry(Addressed):
         fields |= {"control": self._control.address, "tracker": self._tracker}
         self._entry = record_of(ENTRY, **fields, sensed_scale=sensed_scale, drive_scale=drive_scale)
         self.user_data = int(self._entry.ctypes.data)
+        self._arrays["copies"][:] = np.concatenate([self._entry.view(np.int64), self._slot.view(np.int64)])
 
     def _buffers(self) -> dict[str, Array]:
         """Signals of a block, gains that wait, and the log."""
@@ -135,6 +147,7 @@ class RealtimeEntry(Addressed):
             "flags": np.zeros(block, np.int64),
             "bump": np.zeros(controller.channels),
             "gains": np.zeros((self.ahead + block, 2)),
+            "copies": np.zeros((COPIES, WORDS), np.int64),
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
 
@@ -258,6 +271,22 @@ class RealtimeEntry(Addressed):
             self._slot["calls"] += 1
         self._hand_over()
 
+    def foreseen(self, seconds: float) -> tuple[Any, Array]:
+        """Return the entry as it was between its last two blocks, and the finger's path from then on (m, shape (2, n)).
+
+        It reaches `ahead` samples and `seconds` far; the second row is NaN while the finger is lifted.
+        """
+        while True:
+            samples = self.samples
+            words = self._arrays["copies"][(samples // self.block - 1) % COPIES].copy()
+            if self.samples - samples < (COPIES - 2) * self.block:
+                break
+        path = np.zeros((2, self.ahead + round(seconds * self.rate) + 2 * self.frames))
+        entry, slot = words[:ENTRY_WORDS].view(ENTRY), words[ENTRY_WORDS:]
+        entry["block"], entry["position_at"] = path.shape[1], path[1:].ctypes.data
+        foresee(words.ctypes.data, slot.ctypes.data, path.ctypes.data)
+        return entry, path
+
     def silence(self) -> None:
         """Set zero drive from the next block on, whatever is sensed."""
         self._slot["playing"] = 0
@@ -315,4 +344,4 @@ class RealtimeEntry(Addressed):
     def _hand_over(self) -> None:
         with self._writing:
             self._slots[self._back] = self._slot[0]
-            self._back = int(publish(self.user_data, self._back))
+            self._back = int(publish(self.user_data + MIDDLE_AT, self._back))

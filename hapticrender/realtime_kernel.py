@@ -14,7 +14,7 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
 from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
-from hapticrender.sampled_texture import TEXTURE_T, evaluate, smoothstep, value_at
+from hapticrender.sampled_texture import FRESH, TEXTURE_T, evaluate, runs_out, smoothstep, value_at
 
 HORIZON = 0.05  # s: without a new position the finger stays where it was bound for by then,
 HOLD = 0.25  # s: and after so long a function of position fades out
@@ -23,7 +23,6 @@ CONTINUE, ABORT = 0, 2  # results of PortAudio's callback
 OVERRUN, STOPPED = int(Flag.OVERRUN), int(Flag.STOPPED)
 LOST = 0b1111  # PortAudio's status: input or output under- or overflow
 F4 = types.float32
-FRESH = 4  # bit beside the number of the slot in the middle: not yet read
 
 SLOT = np.dtype(
     [
@@ -40,7 +39,8 @@ the state that it shares with others (see `control.state_transfer`); the drive's
 CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
-    "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at tracker"
+    "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
+    "tracker"
 )
 _COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken"
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
@@ -54,12 +54,8 @@ ENTRY = np.dtype(
 )
 ENTRY_T = numba.from_dtype(ENTRY)
 MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
-
-
-@entry
-def publish(entry, back):
-    """Swap the writer's slot `back` for the one in the middle; returns the writer's next slot."""
-    return swap(entry + MIDDLE_AT, back | FRESH) & (FRESH - 1)
+COPIES = 8  # of entry and slot, one a block
+ENTRY_WORDS, WORDS = ENTRY.itemsize // 8, (ENTRY.itemsize + SLOT.itemsize) // 8
 
 
 @kernel
@@ -186,14 +182,14 @@ def follow_finger(entry, slot, m):
 
 
 @kernel
-def texture_at(entry, sample, position, gain, touch, index):
-    """Texture at a sample, while one fades into the next one; `index` of what Python has evaluated of the block."""
+def texture_at(entry, sample, position, gain, touch):
+    """Texture at a sample, while one fades into the next one."""
     e = record(entry, ENTRY_T, 0)
     (before, present), total = shares(entry, sample), 0.0
     if e.current != 0:
-        total += present * gain * value_at(e.current, sample, position, touch, index)
+        total += present * gain * value_at(e.current, sample, position, touch)
     if e.previous != 0 and before > 0.0:
-        total += before * gain * value_at(e.previous, sample, position, touch, index)
+        total += before * gain * value_at(e.previous, sample, position, touch)
     return total
 
 
@@ -214,19 +210,22 @@ def play_texture(entry, slot):
         e.gain += e.gain_pole * (s.gain - e.gain)
         then = (e.samples + m + e.ahead) % size
         gains[then, 0], gains[then, 1] = e.gain, smoothstep(e.touch)
-    evaluate(e.current, e.samples)
+    if e.current != 0:
+        evaluate(e.current, e.samples, e.ahead)
     if e.previous != 0 and shares(entry, e.samples)[0] > 0.0:
-        evaluate(e.previous, e.samples)
+        evaluate(e.previous, e.samples, e.ahead)
     for m in range(e.block):
         now = e.samples + m
         before, present = shares(entry, now)
         gain, touch = gains[(now + e.ahead) % size, 0], gains[(now + e.ahead) % size, 1]
         if analysed:
-            waveform[m] = texture_at(entry, now + e.ahead, places[1, m], gain, touch, e.block + m)
+            waveform[m] = texture_at(entry, now + e.ahead, places[1, m], gain, touch)
         else:
             waveform[m] = gain * (before + present)
         gain, touch = gains[now % size, 0], gains[now % size, 1]
-        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, places[0, m], gain, touch, m)
+        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, places[0, m], gain, touch)
+    if e.current != 0 and runs_out(e.current, e.samples + e.ahead, e.block):
+        e.lost |= OVERRUN
     e.age += e.block
     e.taken += e.block
 
@@ -281,6 +280,25 @@ def stop(entry):
 
 
 @kernel
+def keep(entry, slot):
+    """Copy entry and slot between two blocks, for `foresee`."""
+    e = record(entry, ENTRY_T, 0)
+    copies = carray(pointer(e.copies_at, I8), (COPIES, WORDS))
+    row = (e.samples // e.block) % COPIES
+    copies[row, :ENTRY_WORDS] = carray(pointer(entry, I8), ENTRY_WORDS)
+    copies[row, ENTRY_WORDS:] = carray(pointer(slot, I8), WORDS - ENTRY_WORDS)
+
+
+@entry
+def foresee(entry, slot, path):
+    """Where a copy of the entry lets the finger be from its next sample on (m, shape (2, n)); 2: NaN while lifted."""
+    e = record(entry, ENTRY_T, 0)
+    places = carray(pointer(path, F8), (2, e.block))
+    for m in range(e.block):
+        places[0, m] = follow_finger(entry, slot, m)[0]
+
+
+@kernel
 def advance(entry):
     """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
     e = record(entry, ENTRY_T, 0)
@@ -298,6 +316,7 @@ def advance(entry):
     write_log(entry, slot)
     e.flags |= raised
     e.samples += e.block
+    keep(entry, slot)
     return raised
 
 

@@ -1,8 +1,12 @@
 """A texture in memory as compiled code reads it: a ring of samples in time, and a profile along the surface.
 
 `SampledTexture.fill` keeps the ring a few seconds ahead.  The profile is sampled once, `STEP` apart, and read by cubic
-interpolation, whose error at 25 points a wavelength is 1e-4.  A sum of textures has both.  A texture in time and place
-at once is an `EvaluatedTexture`: compiled code calls Python for it in every block.
+interpolation, whose error at 25 points a wavelength is 1e-4.  A sum of textures has both.
+
+A texture in time and place at once fills the ring, too.  Where Python runs the device it is an `EvaluatedTexture`:
+compiled code calls Python for it in every block.  Of a `ForeseenTexture` Python evaluates a piece of `PIECE` seconds
+again and again, for where the finger will be, and hands it over through a triple buffer; compiled code lets it fade in
+over what it replaces.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, Addressed, call, kernel, pointer, record, record_of
+from hapticrender.jit import F8, Addressed, call, entry, kernel, pointer, record, record_of, swap
 from hapticrender.protocols import Array, Rendering, Texture
 from hapticrender.touch.composed import PLACES, SOON, SeparatedTexture
 
@@ -23,19 +27,30 @@ AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is 
 CHUNK = 4096  # samples computed at once
 STEP, REACH = 2e-6, 0.15  # m: of the profile, and to either side of the surface's middle
 FADE = 0.04  # s: of one texture into another, and of what ends
+PIECE, BLEND = 0.2, 5e-3  # s: evaluated at once of a texture in time and place; in which it fades over the one before
+SLOTS, FRESH = 3, 4  # pieces; bit beside the number of the one in the middle: not yet read
 
 TEXTURE = np.dtype(
     [
-        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "profile_at", "points", "control")),
-        *((name, np.int64) for name in ("evaluate", "values_at", "follows")),
-        *((name, np.float64) for name in ("start", "spacing", "fade")),
+        *((name, np.int64) for name in ("samples_at", "length", "written", "begun", "back", "profile_at", "points")),
+        *((name, np.int64) for name in ("control", "follows", "evaluate", "pieces_at", "width", "middle", "slot")),
+        *((name, np.float64) for name in ("start", "spacing", "fade", "blend")),
     ]
 )
-"""Ring of samples, how many were ever written, the sample at which the texture began; profile from `start` (m) on; the
-record of the controller that plays it (`realtime_kernel.CONTROL`).  Function that evaluates it, values of the block at
-its samples and the look-ahead later, whether they are 0 while the finger is away."""
+"""Ring of samples, how many were ever written, the sample at which the texture began, the one from which on it fades in
+again after none was there; profile from `start` (m) on; the record of the controller that plays it
+(`realtime_kernel.CONTROL`); whether its samples are 0 while the finger is away.  Function that evaluates a block of
+them; or pieces of `width` numbers: which sample is the first, then the samples."""
 READER = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64)
 TEXTURE_T = numba.from_dtype(TEXTURE)
+MIDDLE_AT = TEXTURE.fields["middle"][1] if TEXTURE.fields else 0
+FOREVER = 2**61  # samples: longer than anything plays
+
+
+@entry
+def publish(middle, back):
+    """Swap the writer's slot `back` for the one in the middle, whose number is at an address; returns the next one."""
+    return swap(middle, back | FRESH) & (FRESH - 1)
 
 
 @kernel
@@ -47,12 +62,14 @@ def smoothstep(x):
 
 @kernel
 def in_time(texture, sample):
-    """Its function of time, at a sample of the device's clock; fades out where nothing has been written yet."""
+    """Its function of time, at a sample of the device's clock; fades out where nothing is written yet, and back."""
     v = record(texture, TEXTURE_T, 0)
     k = sample - v.begun
     if v.length == 0 or k < 0 or k >= v.written:
         return 0.0
-    return smoothstep((v.written - k) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
+    return (
+        smoothstep(min(v.written - k, k - v.back) / v.fade) * carray(pointer(v.samples_at, F8), v.length)[k % v.length]
+    )
 
 
 @kernel
@@ -71,21 +88,45 @@ def along_surface(texture, position):
 
 
 @kernel
-def evaluate(texture, sample):
-    """Let Python evaluate it for the block that begins at a sample of the device's clock, if it is one in both."""
-    if texture != 0:
-        v = record(texture, TEXTURE_T, 0)
-        if v.evaluate != 0:
-            call(v.evaluate, (sample - v.begun,))
+def runs_out(texture, sample, block):
+    """Whether its function of time fades out at the sample that begins a block, as no more has been written.
+
+    What is written meanwhile fades in from the next block on, from the share that is left by then.
+    """
+    v = record(texture, TEXTURE_T, 0)
+    after = sample + block - v.begun
+    out = v.length > 0 and v.written - (sample - v.begun) < v.fade
+    if out and v.width == 0:
+        v.back = after - max(v.written - after, 0)
+    return out
 
 
 @kernel
-def value_at(texture, sample, position, touch, index):
-    """Texture at a sample and a position (m), with the share of touch; `index` of the values that are evaluated."""
+def evaluate(texture, sample, ahead):
+    """Take up what Python evaluates of a texture in time and place, for the block that begins at a sample.
+
+    Python is called, or what it has evaluated meanwhile fades in over what it replaces, from the first sample on that
+    has not been read; more slowly where that was fading out.  Those before it are read again, for the log.
+    """
     v = record(texture, TEXTURE_T, 0)
     if v.evaluate != 0:
-        return (touch if v.follows > 0 else 1.0) * carray(pointer(v.values_at, F8), index + 1)[index]
-    return in_time(texture, sample) + touch * along_surface(texture, position)
+        call(v.evaluate, (sample - v.begun,))
+    if v.middle & FRESH:
+        v.slot = swap(texture + MIDDLE_AT, v.slot) & (FRESH - 1)
+        piece = carray(pointer(v.pieces_at, F8), (SLOTS, v.width))[v.slot]
+        ring, first, unread = carray(pointer(v.samples_at, F8), v.length), int(piece[0]), sample + ahead - v.begun
+        over = v.blend if v.written - unread > v.fade else v.fade
+        for k in range(unread - ahead, first + v.width - 1):
+            before, share = in_time(texture, v.begun + k), smoothstep((k - unread) / over) if k >= first else 0.0
+            ring[k % v.length] = before + share * (piece[1 + max(k - first, 0)] - before)
+        v.written = max(v.written, first + v.width - 1)
+
+
+@kernel
+def value_at(texture, sample, position, touch):
+    """Texture at a sample and a position (m), with the share of touch."""
+    share = touch if record(texture, TEXTURE_T, 0).follows > 0 else 1.0
+    return share * in_time(texture, sample) + touch * along_surface(texture, position)
 
 
 class SampledTexture(Addressed):
@@ -99,7 +140,8 @@ class SampledTexture(Addressed):
         self._profile = self._parts.along_surface(places)
         arrays = {"samples_at": self._samples, "profile_at": self._profile}
         sizes = {"length": len(self._samples), "points": len(self._profile)}
-        self.record = record_of(TEXTURE, **arrays, **sizes, start=-REACH, spacing=STEP, fade=FADE * rate)
+        numbers = {"start": -REACH, "spacing": STEP, "fade": FADE * rate, "back": -FOREVER}
+        self.record = record_of(TEXTURE, **arrays, **sizes, **numbers)
         self.address = int(self.record.ctypes.data)
         self.fill(0)
 
@@ -125,33 +167,71 @@ class EvaluatedTexture(Addressed):
     """
 
     def __init__(self, rendering: Rendering, ahead: int, places: Array, position: Array) -> None:
+        self._prepare(rendering, ahead + len(position))
+        self._places, self._position, steps = places, position, np.arange(len(position))
+        self._later = np.concatenate([steps, ahead + steps])
+        self.error: BaseException | None = None
+        self._read = READER(self._evaluate)
+        address = ctypes.cast(self._read, ctypes.c_void_p).value
+        self._describe(evaluate=address, written=FOREVER)
+
+    def _prepare(self, rendering: Rendering, length: int) -> None:
         bands, name = rendering.bands, type(rendering.scene.texture).__name__
         self._waveform = partial(bands.checked, name, rendering.waveform)
         tried = np.repeat(SOON, len(PLACES)), np.tile(PLACES, len(SOON))
         if (self._waveform(*tried) != self._waveform(*tried)).any():
             raise ValueError(f"{name}: must not change with a reading")
-        self._places, self._position, self._follows = places, position, bands.follows_finger
-        steps = np.arange(len(position))
-        self._later = np.concatenate([steps, ahead + steps]) / rendering.driver.rate
-        self._rate, self._values = rendering.driver.rate, np.zeros(places.size)
+        self._rate, self._follows, self._samples = rendering.driver.rate, bands.follows_finger, np.zeros(length)
         self.control: Any = None  # keeps the controller that plays it alive
-        self.error: BaseException | None = None
-        self._read = READER(self._evaluate)
-        address = ctypes.cast(self._read, ctypes.c_void_p).value
-        self.record = record_of(TEXTURE, evaluate=address, values_at=self._values, follows=self._follows)
+
+    def _describe(self, **values: Any) -> None:
+        self.record = record_of(
+            TEXTURE,
+            samples_at=self._samples,
+            length=len(self._samples),
+            back=-FOREVER,
+            follows=self._follows,
+            **values,
+        )
         self.address = int(self.record.ctypes.data)
+
+    def _values(self, samples: Array, places: Array, position: Array) -> Array:
+        """Texture at its samples with the finger at `places` (m); lifted where `position` is NaN."""
+        if not self._follows:
+            places = np.where(np.isnan(position), np.nan, places)
+        return np.asarray(self._waveform(np.maximum(samples / self._rate, 0.0), places))
 
     def _evaluate(self, sample: int) -> int:
         try:
+            index, values = sample + self._later, np.zeros(len(self._later))
             if self.error is None:
-                position = self._places.copy()
-                if not self._follows:
-                    position[:, np.isnan(self._position)] = np.nan
-                time = np.maximum(sample / self._rate + self._later, 0.0)
-                self._values[:] = self._waveform(time, position.ravel())
+                values = self._values(index, self._places.ravel(), np.tile(self._position, 2))
         except BaseException as error:
-            self.error, self._values[:] = error, 0.0
+            self.error = error
+        self._samples[index % len(self._samples)] = values
         return 0
 
     def fill(self, now: int) -> None:
         """Nothing is computed ahead."""
+
+
+class ForeseenTexture(EvaluatedTexture):
+    """As an `EvaluatedTexture`, but evaluated ahead of a callback that holds no lock: `PIECE` beyond the look-ahead.
+
+    `path` (m, shape (2, ahead + n)) is where the finger will be from the next sample on, and with NaN while lifted.
+    """
+
+    def __init__(self, rendering: Rendering, ahead: int, path: Array) -> None:
+        self._ahead, count = ahead, path.shape[1] - ahead
+        self._prepare(rendering, 2 * (ahead + count))
+        self._pieces, self._back = np.zeros((SLOTS, 1 + count)), 0
+        self._samples[:count] = self._values(np.arange(count), *path[:, :count])
+        buffer = {"pieces_at": self._pieces, "width": 1 + count, "middle": 1, "slot": 2}
+        rate = self._rate
+        self._describe(written=count, fade=FADE * rate, blend=BLEND * rate, **buffer)
+
+    def foresee(self, sample: int, path: Array) -> None:
+        """Evaluate it again for a path that begins at `sample` of the device's clock."""
+        first, piece = sample + self._ahead - int(self.record["begun"][0]), self._pieces[self._back]
+        piece[0], piece[1:] = first, self._values(first + np.arange(len(piece) - 1), *path[:, self._ahead :])
+        self._back = int(publish(self.address + MIDDLE_AT, self._back))

@@ -52,7 +52,7 @@ def _check_run_folder(folder: Path, arguments: argparse.Namespace, source: Path 
 def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
     from hapticrender.report import outputs
-    from hapticrender.report.page import refuse_other_page, write_page
+    from hapticrender.report.page import write_page
     from hapticrender.report.progress import progress
     from hapticrender.touch.builtin_scenes import builtin_scenes
 
@@ -60,7 +60,7 @@ def demo(arguments: argparse.Namespace) -> int:
     for name in scenes:
         _check_run_folder(arguments.out / name, arguments)
     if not arguments.force:
-        refuse_other_page(arguments.out)
+        outputs.refuse_other_page(arguments.out)
     renderings = _prepare(scenes, arguments)
     finished: list[Outputs] = []
     try:
@@ -109,7 +109,7 @@ def play(arguments: argparse.Namespace) -> int:
     from hapticrender.checks import number
     from hapticrender.player import Player
     from hapticrender.report import outputs
-    from hapticrender.report.page import refuse_other_page, write_page
+    from hapticrender.report.page import write_page
 
     scene, out = _scene(arguments.scene), arguments.out
     changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
@@ -118,7 +118,7 @@ def play(arguments: argparse.Namespace) -> int:
     if out:
         _check_run_folder(out / scene.name, arguments)
         if not arguments.force:
-            refuse_other_page(out)
+            outputs.refuse_other_page(out)
     journal, above, second = None, 0, 0
     try:
         with (

@@ -3,6 +3,7 @@
  * jack_plate CLIENT FILE: FILE holds four whole numbers (states, inputs, outputs, samples to record), the rms of the
  * noise in full scales, then A, B, C and D row by row.  Ports are in_1.. and out_1..  Commands on standard input:
  *   run N     go through N periods as fast as all clients can (freewheel)
+ *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
  *   stall MS  sleep once inside a period: the server reports an overrun
  *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
  *   count     print periods, overruns that JACK reported, and the time of the server in frames
@@ -26,7 +27,7 @@ static double noise, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[
 static float *record;
 static jack_client_t *client;
 static jack_port_t *in_port[MOST], *out_port[MOST];
-static atomic_long periods, overruns, stall;
+static atomic_long periods, overruns, pace, stall;
 static uint64_t seed = 88172645463325252u;
 
 /* Sum of 12 uniform numbers: variance 1, peak 6. */
@@ -79,7 +80,7 @@ static int process(jack_nframes_t frames, void *unused) {
         }
     }
     atomic_fetch_add(&periods, 1);
-    long sleep = atomic_exchange(&stall, 0);
+    long sleep = atomic_exchange(&stall, 0) + atomic_load(&pace);
     if (sleep) pause_ms(sleep);
     return 0;
 }
@@ -128,6 +129,7 @@ static void obey(char *line) {
     char name[4096];
     sscanf(line, "gain %lf %lf", &next_gain, &above);
     if (sscanf(line, "run %ld", &number) == 1) run(number);
+    if (sscanf(line, "pace %ld", &number) == 1) atomic_store(&pace, number);
     if (sscanf(line, "stall %ld", &number) == 1) atomic_store(&stall, number);
     if (sscanf(line, "save %4095[^\n]", name) == 1) save(name);
     printf("%ld %ld %u\n", atomic_load(&periods), atomic_load(&overruns), jack_frame_time(client));

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ import jack_ring
 import numpy as np
 import pytest
 from jack_ring import BLOCK, CLIENT, METRES, NOISE, RATE, ROUND_TRIP, driver, entry_for, lost_callbacks, relative_errors
+from test_player_textures import MOVING
 from waves import phasor
 
 import hapticrender as hr
@@ -398,3 +400,53 @@ def test_a_busy_python_thread_costs_the_compiled_callback_nothing(connected):
         differences.append(busy - idle)
     assert min(differences) <= 0.003
     assert lost_callbacks(device, jack_ring.PythonEntry, jack_ring.busy_thread, 1.5) > 0.3
+
+
+def fitted(signal, turns):
+    """Complex amplitude of a signal at a phase (turns), and the rms of what is left."""
+    waves = np.stack([np.cos(2 * np.pi * turns), -np.sin(2 * np.pi * turns)], axis=1)
+    found = np.linalg.lstsq(waves, signal)[0]
+    return complex(*found), float(np.sqrt(np.mean((signal - waves @ found) ** 2)))
+
+
+def test_a_texture_in_time_and_place_follows_a_sliding_finger(connected, tmp_path):
+    """At the pace of a clock, but every period waits for all: within the law's 2 %, and at the finger's real place.
+
+    What is evaluated ahead is at most 160 ms old where it is not flagged, so that its place is wrong by no more than
+    the finger's position deviates from what it was bound for before; with 1 mm a turn, that times 2 pi is the error.
+    """
+    device, speed = connected(jack_ring.plate(), noise=NOISE / METRES), 0.02
+    with hr.Player("vt-plate", jack_ring.driver(), profile={"rate": RATE}) as player, ThreadPoolExecutor(1) as pool:
+        player.finger(-0.04, speed, 0.8)
+        player.play(MOVING)
+        device.say("pace 2")
+        player.record(tmp_path / "moving.au")
+        running = pool.submit(device.say, f"run {PERIODS}")
+        while not running.done():
+            player.finger(-0.04 + speed * player.time, speed, 0.8)
+            player.sleep(0.01)
+        device.say("pace 0")
+        recording = player.end_recording()
+    whole = np.flatnonzero(recording.flags & Flag.OVERRUN == 0)
+    found = np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1)
+    here = max(found, key=len)[round(0.5 * RATE) :]
+    assert len(here) > RATE / 2
+    turns = 200.0 * np.arange(len(recording)) / RATE + 1e3 * recording.position
+    texture, left = fitted(recording.reference[here], turns[here])
+    moved, _ = fitted(recording.motion[here, 0], turns[here])
+    ages, place = np.arange(0.002, 0.16, 0.002) * RATE, recording.position
+    gone = [abs(place[here] - place[here - round(age)] - speed * age / RATE) for age in ages]
+    wrong = 2 * np.pi * 1e3 * float(np.sqrt(np.mean(np.max(gone, axis=0) ** 2)))
+    assert abs(texture) == pytest.approx(5e-6, rel=wrong)
+    assert left < wrong * 5e-6
+    scene = hr.Scene(
+        texture=MOVING,
+        finger=hr.Finger.sliding(speed=speed, normal_load=0.8, mechanics="heavy"),
+        profile={"rate": RATE, "delay": ROUND_TRIP},
+        duration=1.0,
+    )
+    run = hr.render(scene)
+    turns = 200.0 * np.arange(len(run)) / RATE + 1e3 * run.position
+    here = slice(len(run) // 2, None)
+    expected = fitted(run.motion[here, 0], turns[here])[0] / fitted(run.reference[here], turns[here])[0]
+    assert abs(moved / texture - expected) < 0.02

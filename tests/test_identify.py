@@ -297,7 +297,7 @@ def lost(sensed):
         (
             lambda s: s._replace(flags=np.array([Flag.OVERRUN])),
             hr.DesignError,
-            "sample 3000: the device reports .*OVERR",
+            "sample 3000: the device reports OVERRUN: free the computer",
         ),
         (lambda s: s._replace(flags=np.array([Flag.SATURATED])), hr.DesignError, "SATURATED.*decrease amplitude"),
         (lambda s: s._replace(sensed=np.full((1, 2), 1e-3)), hr.DesignError, r"0.001 m at .* within \+-0.001 m; check"),

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from synthetic import make_bands, make_recording
 
-from hapticrender.report.outputs import FILES, Outputs
-from hapticrender.report.page import page, refuse_other_page, write_page
+from hapticrender.report.outputs import FILES, Outputs, refuse_other_page, refuse_to_overwrite
+from hapticrender.report.page import page, write_page
 
 VOID = {"meta", "img", "br"}
 SOUND = {"drive.wav": {"full_scale": 2.0, "unit": "A"}, "sensed.wav": {"full_scale": 2e-5, "unit": "m"}}
@@ -72,9 +72,12 @@ def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
 def test_only_a_page_of_ours_is_replaced(tmp_path):
     write_page(tmp_path, [])
     refuse_other_page(tmp_path)
+    refuse_to_overwrite(tmp_path)  # with a scene's files: a page and `summary.json` are all there is
     (tmp_path / "index.html").write_text("<p>mine</p>")
     with pytest.raises(ValueError, match="from no earlier run"):
         refuse_other_page(tmp_path)
+    with pytest.raises(ValueError, match="from no earlier run"):
+        refuse_to_overwrite(tmp_path)
 
 
 def test_nothing_in_a_scene_becomes_markup(tmp_path):

@@ -323,6 +323,11 @@ def test_what_it_refuses(tmp_path):
         hr.Player(watchdog=0)
     with hr.Player(driver=Calling(), paced=False) as player, pytest.raises(ValueError, match="paced = False"):
         player.play(TONE)
+    with hr.Player(paced=False) as player:
+        player.play(TONE)
+        for path in (None, 3):
+            with pytest.raises(TypeError, match=r"path .*: must be the name of a journal, such as session\.au"):
+                player.record(path)
     with pytest.raises(TypeError, match="texture: .* call play"):
         hr.Player(texture=TONE)
     with hr.Player() as player:

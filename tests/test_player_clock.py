@@ -2,11 +2,14 @@
 
 import threading
 import time
+from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from live_devices import TONE, Lying
+from test_player_textures import Own
 
 import hapticrender as hr
 from hapticrender import live_threads
@@ -24,6 +27,32 @@ def test_a_device_that_is_left_behind_by_the_clock_has_lost_samples(slow):
         player.play(TONE)
         player.sleep(0.8)
         assert (hr.Flag.OVERRUN in player.state().flags) == slow
+
+
+@dataclass(frozen=True)
+class Slow(Own):
+    """It takes 0.15 s once, where a simulation evaluates it sample by sample."""
+
+    at: Any = None
+
+    def waveform(self, time, position):
+        if self.at is not None and self.at.is_set():
+            self.at.clear()
+            threading.Event().wait(0.15)
+        return super().waveform(time, position)
+
+
+def test_a_simulation_that_is_slower_than_the_clock_is_flagged_and_counted():
+    at = threading.Event()
+    with hr.Player() as player:
+        player.play(Slow(1e3, 200.0, at=at))
+        player.sleep(0.3)
+        before = player.state().lost
+        at.set()
+        player.sleep(0.3)
+        state = player.state()
+    assert hr.Flag.OVERRUN in state.flags
+    assert state.lost > before
 
 
 class Device:

@@ -23,8 +23,8 @@ from hapticrender.mathx import smoothstep
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
-from hapticrender.realtime_kernel import ENTRY, FRESH, HOLD, HORIZON, JUMP, MIDDLE_AT, publish, swap
-from hapticrender.sampled_texture import FADE, SampledTexture
+from hapticrender.realtime_kernel import ENTRY, HOLD, HORIZON, JUMP, MIDDLE_AT, swap
+from hapticrender.sampled_texture import AHEAD, FADE, FRESH, SampledTexture, publish
 
 RATE, BLOCK = 5000.0, 10
 PLAIN = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p)
@@ -194,6 +194,35 @@ def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_
         assert goes_on or abs(log[-100:]).max() == 0.0
 
 
+def test_a_program_that_hangs_fades_a_texture_in_time_out_and_back_without_a_step():
+    """It is 2 s ahead: what fades, and is 0, is flagged; it comes back in its own time."""
+    entry, texture = RealtimeEntry(designed(False, True)), SampledTexture(wave(False), RATE)
+    entry.play(texture)
+    log = []
+    for seconds, filled in ((AHEAD - FADE, False), (0.1, True), (0.2, False), (AHEAD, True), (0.2, False)):
+        start = entry.samples
+        for _ in range(round(seconds * RATE / 100)):  # the log holds 2 s
+            start = entry.samples
+            plain(entry, np.zeros((100, 2)))
+            log.append(entry.log(start))
+        if filled:
+            entry.fill()
+    reference, flags = (np.concatenate([each[name] for each in log]) for name in ("reference", "flags"))
+    late = flags & Flag.OVERRUN > 0
+    silent = slice(round((AHEAD + 0.01) * RATE), round((AHEAD - FADE + 0.1) * RATE))
+    assert not late[: round((AHEAD - FADE) * RATE) - 1].any()
+    assert late[silent].all()
+    assert not reference[silent].any()
+    whole = slice(silent.stop + entry.ahead + round(FADE * RATE) + 1, silent.stop + round(0.2 * RATE))
+    since = (np.arange(len(reference)) - entry.ahead) / RATE
+    expected = wave(False).waveform(since, since)
+    np.testing.assert_allclose(reference[whole], expected[whole], rtol=0, atol=1e-14)
+    assert not late[whole].any()
+    # 1.5 of its size in a fade, and its own slope
+    steepest = abs(expected).max() * 1.5 / (FADE * RATE) + abs(np.diff(expected)).max()
+    assert abs(np.diff(reference)).max() < steepest
+
+
 def test_a_gain_is_reached_without_a_step():
     entry = RealtimeEntry(designed(False, True))
     entry.play(SampledTexture(wave(False), RATE))
@@ -307,7 +336,7 @@ def write(entry, slots, width, rounds):
     for i in range(1, rounds + 1):
         for j in range(width):
             table[back, j] = i
-        back = publish(entry, back)
+        back = publish(entry + MIDDLE_AT, back)
     return 0
 
 

@@ -181,7 +181,7 @@ TEXTURES = [
     (lambda: sampled(lambda t, x: t * np.isfinite(x)), "Own: must not change with the finger's position or contact"),
     (
         lambda: sampled(lambda t, x: t + x, True),
-        "Own: must not change with time on a sound card or",
+        "Own: must not change with time on a board: it is a function of position",
     ),
     (lambda: hr.Scene.from_toml_text(PARTS), r"texture\.parts\[1\]\[0\]\.kind = 'chimp': must be one of"),
     (lambda: detection_threshold([20.0, -3.0]), r"frequency = .*: must be finite numbers >= 0 Hz$"),

@@ -335,9 +335,8 @@ def play(driver: Driver, drive: Array) -> Sensed:
             sensed = check_sensed(driver, given, 0)
             raised = Flag(0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
             if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED | Flag.OVERRUN):
-                raise DesignError(
-                    f"sample {start}: the device reports {raised!r}: must be no fault; decrease amplitude, or mend it"
-                )
+                cure = "free the computer, or take a larger block" if raised & Flag.OVERRUN else "decrease amplitude"
+                raise DesignError(f"sample {start}: the device reports {raised.name}: {cure}")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
         try:

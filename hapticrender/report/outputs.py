@@ -22,6 +22,7 @@ from hapticrender.report import picture
 from hapticrender.touch.scene import Scene
 
 JOURNAL = "recording.au"
+GENERATOR = '<meta name="generator" content="hapticrender">'  # in every page
 FILES = ("scene.toml", JOURNAL, "drive.wav", "sensed.wav", "picture.png", "summary.json")
 
 
@@ -71,9 +72,22 @@ def written_in(folder: Path) -> list[Path]:
     return [folder / name for name in FILES if (folder / name).exists()]
 
 
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
+
+
+def refuse_other_page(folder: Path) -> None:
+    """Refuse a folder whose ``index.html`` this package has not written."""
+    path = folder / "index.html"
+    if path.exists() and GENERATOR not in _text(path):
+        raise ValueError(f"{str(path)!r}: is there and from no earlier run: choose another folder, or add --force")
+
+
 def refuse_to_overwrite(folder: Path, source: Path | None = None) -> None:
     """Refuse a folder in which files would be overwritten that no earlier run has written, or the scene `source`."""
     present = written_in(folder)
+    if present == [folder / "summary.json"] and GENERATOR in _text(folder / "index.html"):
+        return  # the page of `play`, `demo` or `validate`
     for path in present:
         if source is not None and source.exists() and path.samefile(source):
             raise ValueError(f"{str(path)!r}: would overwrite the scene itself: choose another folder")

@@ -10,22 +10,14 @@ from urllib.parse import quote
 
 from hapticrender import __version__
 from hapticrender.formatting import as_json, bands_label, short
-from hapticrender.report.outputs import JOURNAL, Outputs
+from hapticrender.report.outputs import GENERATOR, JOURNAL, Outputs
 from hapticrender.report.text import band_rows, conditions, overview, remarks, verdict, waveform_rows
 
 _MANY_BANDS = 10  # beyond so many their table is folded
 NO_PICTURE = '<p class="note">No picture: matplotlib is not installed.</p>'
-GENERATOR = '<meta name="generator" content="hapticrender">'
 CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not judged": "note"}
 
 STYLE = "\n" + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
-
-
-def refuse_other_page(folder: Path) -> None:
-    """Refuse a folder whose ``index.html`` this package has not written."""
-    path = folder / "index.html"
-    if path.exists() and GENERATOR not in path.read_text(encoding="utf-8", errors="replace"):
-        raise ValueError(f"{str(path)!r}: is there and from no earlier run: choose another folder, or add --force")
 
 
 def write_page(folder: Path, scenes: Sequence[Outputs]) -> Path:

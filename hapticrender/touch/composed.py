@@ -80,7 +80,7 @@ class SeparatedTexture:
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:
-        terms, name, here = _terms(texture), type(texture).__name__, " on a sound card or a board"
+        terms, name, here = _terms(texture), type(texture).__name__, " on a board"
         for each, _ in terms:
             kinds = {is_spatial(part) for part, _ in getattr(each, "parts", ())}
             if kinds == {True, False} or (True in kinds and not isinstance(each, Sum)):
