@@ -365,7 +365,7 @@ CASES: dict[str, Case] = {
     "comb": lambda bench: comb(bench.of(**RIGID)),
     "sweeps": lambda bench: sweeps(bench.of(**RIGID)),
     "touch": touch,
-    "touch rigid": lambda bench: worst_touch(bench.of(**RIGID)),
+    "touch rigid": lambda bench: touch(bench.of(**RIGID)),
     "touch wrong": lambda bench: worst_touch(bench.of(**WRONG | RIGID)),
     "touch blocks": in_blocks(worst_touch, 25, 5e3, **RIGID),
     "touch 48 kHz": in_blocks(worst_touch, 64, 48e3, **RIGID),
