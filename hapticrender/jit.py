@@ -223,10 +223,15 @@ def record_of(dtype: np.dtype[Any], *sources: object, **values: Any) -> np.ndarr
                 record[name] = value
     for name, value in values.items():
         by_address = isinstance(value, np.ndarray) and dtype[name] == np.int64
-        if by_address and not value.flags.c_contiguous:
-            raise ValueError(f"{name} of shape {value.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
-        record[name] = value.ctypes.data if by_address else value
+        record[name] = address_of(name, value) if by_address else value
     return record
+
+
+def address_of(name: str, array: np.ndarray[Any, Any]) -> int:
+    """Address of an array that the caller keeps alive; a ValueError where it is not C-contiguous."""
+    if not array.flags.c_contiguous:
+        raise ValueError(f"{name} of shape {array.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
+    return array.ctypes.data
 
 
 class Addressed:
@@ -239,8 +244,12 @@ class Addressed:
 
 
 def addresses(**arrays: np.ndarray[Any, Any] | None) -> np.ndarray[Any, Any]:
-    """Record of the addresses of some signals, shape (1,); see `record_of`."""
-    return record_of(SIGNALS, **{name: array for name, array in arrays.items() if array is not None})
+    """Record of the addresses of some signals, shape (1,); made anew for every block, so not by `record_of`."""
+    record = np.zeros(1, SIGNALS)
+    for name, array in arrays.items():
+        if array is not None:
+            record[name] = address_of(name, array)
+    return record
 
 
 @entry
