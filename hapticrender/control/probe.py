@@ -3,8 +3,8 @@
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
 surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 507
 hypotheses h (13 wirings, each with 13 delays, free and with a finger at either sensor) by the residual
-1 - <y, y_h>/(|y| |y_h|), with offset, slope and parabola taken out of each sensor.  The sensors' noise is that of second differences in the second half of the silence
-after it; its energy is none of the response's.
+1 - <y, y_h>/(|y| |y_h|), with offset, slope and parabola taken out of each sensor.  The sensors' noise is that of
+second differences in the second half of the silence after it; its energy is none of the response's.
 """
 
 from __future__ import annotations
