@@ -116,6 +116,24 @@ def waveform_law(seconds: float, pairs: int) -> Iterator[Figure]:
                  "the law by bands", f"{ours / len(silence) * 1e6:.2f} us a sample, plate included")  # fmt: skip
 
 
+def supervision(seconds: float, pairs: int) -> Iterator[Figure]:
+    """Both laws with 8 bands under a sliding finger, supervised over bare, each in closed loop with a plate."""
+    parameters = PlateParameters(sensor_noise=1e-6)
+    lines = tuple((n, 1.0, float(n)) for n in (1, 3, 5, 8, 11, 14, 17, 20))
+    texture, silence = hr.Grating(frequency=20.0, amplitude=2e-6, partials=lines), np.zeros(int(seconds * 5e3))
+    for method in ("inverse", "h2"):
+        scene = hr.Scene(texture=texture, finger=SLIDING, duration=1.0, method=method, keep_unfelt=True)
+        rendering = hr.prepare(scene)
+        both: tuple[Any, Any] = (rendering.controller(), rendering.controller().controller)  # type: ignore[attr-defined]
+        works = [partial(Plate(parameters, SLIDING, 1).closed_loop, controller, silence) for controller in both]
+        ours, theirs, ratio = compare(*works, pairs)
+        if both[0].fault is not None:
+            raise RuntimeError(f"supervision of {method}: stopped, {both[0].fault.text}")
+        note = f"{1e9 * (ours - theirs) / len(silence):.0f} ns a sample, plate included"
+        yield Figure(f"supervised {method}, 8 bands, sliding: time over", 1 / ratio, "x", 1.15, 1.15, False,
+                     "the same, not supervised", note)  # fmt: skip
+
+
 def paper(pairs: int) -> Iterator[Figure]:
     """The paper's method, 64 bands, times faster than naive C in double; outputs are compared."""
     bands, parameters, samples = comb(64, 1e-6), PlateParameters(), 4096
@@ -213,6 +231,7 @@ def every_case(short: bool) -> dict[str, Callable[[], Iterator[Figure]]]:
     cases |= {f"closed loop {what}": partial(closed_loop, what, seconds, pairs) for what in FINGERS}
     return cases | {
         "waveform": partial(waveform_law, seconds, pairs),
+        "supervision": partial(supervision, seconds, 3 * pairs),
         "paper": partial(paper, pairs),
         "demodulation": partial(demodulation, 64, pairs),
         "sweep": partial(two_cores, DEVICES, 2.0, 1 if short else 3),

@@ -160,6 +160,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             fault.recording = recorder.finish()
             raise fault
     recording = recorder.finish()
+    recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
     _compare(rendering, loop.controller, recording)
     return recording
 

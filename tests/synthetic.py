@@ -72,12 +72,12 @@ def make_recording(
     return recorder.finish()
 
 
-def make_play(reference: Any, motion: Any, **fields: Any) -> Recording:
+def make_play(reference: Any, motion: Any, position: Any = np.nan, **fields: Any) -> Recording:
     """Recording of a waveform without bands at `RATE`; `motion` is the same at every place, or (n, places)."""
     n, bands = len(reference), Bands.none(spatial=False)
     recorder = make_recorder(None, bands, **({"duration": n / RATE, "settle": 0.0} | fields))
     motion = np.broadcast_to(np.reshape(motion, (n, -1)), (n, len(PLACES)))
-    signals = make_signals(bands, np.zeros(0), duration=n / RATE)
+    signals = make_signals(bands, np.zeros(0), duration=n / RATE, position=position)
     recorder.append(**signals | {"motion": motion, "reference": np.asarray(reference)})
     return recorder.finish()
 

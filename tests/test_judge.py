@@ -329,6 +329,42 @@ def test_h2_on_white_noise_fails(rng):
     assert summary["waveform"]["places"]["centre"]["waveform_error"] > 0.9
 
 
+def test_a_forced_scaling_is_stated():
+    """20 um at 300 Hz take 0.25 A while they last and more as they begin; both runs are alike until the limit acts."""
+    texture = hr.Recorded(samples=20 * UM * np.sin(600 * np.pi * times(2.0)), rate=RATE, gain=1.0)
+    whole, scaled = (
+        hr.render(hr.Scene(texture=texture, duration=2.0, limits={"peak_drive": limit})) for limit in (0.5, 0.26)
+    )
+    assert whole.least_scale == 1.0
+    assert not any("scaled" in note for note in whole.summary()["notes"])
+    assert 0.26 / abs(whole.drive).max() - 2e-3 < scaled.least_scale < 0.99  # 2e-3 of 0.3 A: half the converter's step
+    stated = f"scaled the texture to {scaled.least_scale:.2g} of it at the least"
+    assert [note for note in scaled.summary()["notes"] if stated in note]
+    assert (scaled.flags & Flag.SATURATED).any()
+
+
+def test_errors_after_touches_and_lifts_are_stated_apart(rng):
+    """10 % of the reference is left out for 50 ms after each of three contacts, and 4 % in the 150 ms after that.
+
+    Filters without phase carry some 5 ms over each edge: 5 of 50 ms.
+    """
+    noise, on = white(20, 400, rng), np.array([1.0, 1.8, 2.6])
+    since = np.min(np.where(times(4.0) >= on[:, None], times(4.0) - on[:, None], np.inf), axis=0)
+    motion = noise * (1.0 - np.where(since < 0.05, 0.1, np.where(since < 0.2, 0.04, 0.0)))
+    touching = ((times(4.0) >= 1.0) & (times(4.0) < 1.8)) | (times(4.0) >= 2.6)
+    for position, count in ((np.where(touching, 0.0, np.nan), 3), (np.nan * touching, 0)):
+        recording = make_play(noise, motion, position=position, settle=0.5)
+        contacts = recording.summary()["waveform"]["contacts"]
+        assert contacts["count"] == count
+        stated = "touches and lifts: error" in recording.text()
+        assert stated == bool(count)
+        if count:
+            assert contacts["error_0_50_ms"] == pytest.approx(0.1, rel=0.25)
+            assert contacts["error_50_200_ms"] == pytest.approx(0.04, rel=0.25)
+        else:
+            assert contacts["error_0_50_ms"] is contacts["error_50_200_ms"] is None
+
+
 @pytest.mark.parametrize("left", [0.05, 0.09])
 @pytest.mark.parametrize(("last", "found"), [(1.0, "passed"), (0.0, "failed"), (np.nan, "failed")])
 def test_a_run_is_judged_to_its_end(rng, left, last, found):

@@ -152,6 +152,11 @@ class WaveformController(BankController):
         return self._arrays["loops"][0]
 
     @property
+    def least_scale(self) -> float:
+        """Least factor that has scaled the reference, so that the drive stays within its limit; 1: the whole of it."""
+        return float(self.law["least_scale"])
+
+    @property
     def mismatch(self) -> float:
         """Force that was learned on the untouched device over that of its model, rms over about a second, else 0."""
         law = self.law
@@ -293,6 +298,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "initial_variance": np.repeat(INITIAL_FRICTION if model.finger.contact is None else INITIAL_MOTION, 2) ** 2,
         "scale": 1.0,
         "smooth_scale": 1.0,
+        "least_scale": 1.0,
         "since": 1e9,
         "fade": 0.0,
     }

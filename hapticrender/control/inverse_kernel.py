@@ -207,6 +207,7 @@ def scale_reference(inverse, needed):
         v.peak *= v.decay
     v.scale += v.scale_pole * (1.0 / max(v.peak, 1.0) - v.scale)
     v.smooth_scale += v.scale_pole * (v.scale - v.smooth_scale)
+    v.least_scale = min(v.least_scale, v.smooth_scale)
 
 
 @kernel

@@ -20,12 +20,12 @@ _LAW = "lever_per_metre omega_n pole pole_damping fade_step"
 _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"
 # of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
 _POLES = "gate_threshold high_pass_pole mean_square_pole hold decay scale_pole levelling_pole power_pole"
-# the reference's fade, the drive's largest need and for how long it is held, scale; the finger's lever arm, contact,
+# the reference's fade, the drive's largest need and for how long it is held, scale and its least; lever arm, contact,
 # samples since it changed and without a position (`away`; below 0: until the report of a suspected contact is due);
 # the gate's slow part, mean square and noise; r as the sensors should show it; levelling force; mean squares on the
 # untouched device, see `update_powers`; last sane sample of the waveform
 _STATE = """
-fade peak hold_left scale smooth_scale lever contact since away slow power sensed_noise reference moment
+fade peak hold_left scale smooth_scale least_scale lever contact since away slow power sensed_noise reference moment
 nominal_power learned_power reference_power last_waveform
 """
 

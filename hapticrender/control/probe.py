@@ -1,10 +1,10 @@
 """Start-up probe: check the wiring of a plate's sensors and actuators before the loop closes.
 
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
-surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 169
-hypotheses h (13 wirings, each with 13 delays) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
-parabola taken out of each sensor.  The sensors' noise is that of second differences in the second half of the silence
-after it; its energy is none of the response's.
+surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 507
+hypotheses h (13 wirings, each with 13 delays, free and with a finger at either sensor) by the residual
+1 - <y, y_h>/(|y| |y_h|), with offset, slope and parabola taken out of each sensor.  The sensors' noise is that of
+second differences in the second half of the silence after it; its energy is none of the response's.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ MOST_INVALID, MOST_REPEATS = 0.02, 0.6
 LEAST_ENERGY = 0.005  # of the model's, beyond the noise's: half of what a tenth of the gain leaves
 MOST_RESIDUAL, MOST_WORSE = 0.35, 0.05
 MOST_NOISE = (1 / (1 - MOST_RESIDUAL / 2) ** 2 - 1) ** 0.5  # over |y|: this noise alone leaves half that residual
+FINGER = 5e-3, 6.0, 6e3  # kg, N s/m, N/m at a sensor: half of the most that is expected
 SCALES, DELAY_TOLERANCE = (0.6, 1.6), 2  # samples
 ONE, SWAP = np.eye(2), np.eye(2)[::-1]
 WIRINGS = {  # what is not as stated: sensors (rows are what is sensed), actuators
@@ -100,7 +101,8 @@ def probe_drive(model: DeviceModel) -> Array:
     drive = (gains[:, :, None] * np.sin(2 * np.pi * lines[:, :, None] * time + phases[:, None])).sum(axis=1).T
     drive *= np.sin(np.pi / 2 * edge)[:, None] ** 2
     limit = MOST_DRIVE * model.drive_limit / abs(drive).max()
-    return drive * min(MOTION * model.sensed_limit / abs(_response(model, drive)).max(), limit)
+    response = np.einsum("jjns", _responses(model, drive))
+    return drive * min(MOTION * model.sensed_limit / abs(response).max(), limit)
 
 
 def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
@@ -113,10 +115,6 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     sensed = sensed[: len(drive)]
     stated = model.delay - model.block
     delays = range(max(stated - DELAYS // 2, 0), max(stated - DELAYS // 2, 0) + DELAYS)
-    expected: dict[tuple[str, int], Array] = {}
-    for name, (sensors, actuators) in WIRINGS.items():
-        response = _response(model, drive @ actuators.T) @ sensors.T
-        expected |= {(name, delay): _detrended(_late(response, delay)) for delay in delays}
     valid = np.asarray((abs(sensed) < model.sensed_limit).all(axis=1))
     repeats = (np.diff(sensed, axis=0) == 0.0).mean(axis=0)
     if (~valid).mean() > MOST_INVALID:
@@ -125,19 +123,16 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
         invalid = f"{(~valid).mean():.0%} of the samples are invalid"
         return Found(invalid + beyond * bool(largest > model.sensed_limit), np.nan, np.nan, -1)
     y = _detrended(np.where(valid[:, None], sensed, 0.0))
-    energy, model_energy = float((y**2).sum()), float((expected["nothing", stated] ** 2).sum())
+    residuals, scales, model_energy = _compared(model, drive, y, delays)
+    energy = float((y**2).sum())
     noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise
     if energy - noise**2 * y.size < LEAST_ENERGY * model_energy:
         return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / model_energy) ** 0.5, -1)
     if (repeats > MOST_REPEATS).any():
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
-    residuals = {
-        key: 1.0 - float((y * h).sum()) / max(float(energy * (h**2).sum()) ** 0.5, 1e-300)
-        for key, h in expected.items()
-    }
     best = min(residuals, key=lambda each: residuals[each])
-    own = min((("nothing", delay) for delay in delays), key=lambda each: residuals[each])
-    scale, delay = float((y * expected[own]).sum() / (expected[own] ** 2).sum()), own[1] + model.block
+    own = min((each for each in residuals if each[0] == "nothing"), key=lambda each: residuals[each])
+    scale, delay = scales[own], own[1] + model.block
     most = MOST_NOISE * (model_energy / y.size) ** 0.5
     fault = ""
     if min(residuals[own], residuals[best] + MOST_WORSE) > MOST_RESIDUAL and noise > most:
@@ -153,15 +148,39 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     return Found(fault, residuals[own], scale, delay)
 
 
-def _response(model: DeviceModel, drive: Array) -> Array:
-    """What the free device's sensors show under a drive (n, channels), shape (n, sensors)."""
-    plate = DiscretePlant.free(model.mass, model.damping, model.stiffness, model.rate)
-    forces, state = drive @ (plate.b @ model.force_from_drive).T, np.zeros(len(plate.a))
-    states = np.empty((len(drive), len(state)))
+def _compared(
+    model: DeviceModel, drive: Array, y: Array, delays: range
+) -> tuple[dict[tuple[str, int, int], float], dict[tuple[str, int, int], float], float]:
+    """Residual of every hypothesis (wiring, delay, number of the load), scale of y over it, and energy as stated."""
+    residuals, scales, stated, energy = {}, {}, 0.0, float((y**2).sum())
+    for load, finger in enumerate((None, *np.linalg.inv(model.coordinate_from_sensed))):
+        parts = _responses(model, drive, finger)
+        for name, (sensors, actuators) in WIRINGS.items():
+            response = np.einsum("jk,jkns->ns", actuators, parts) @ sensors.T
+            for delay in delays:
+                h = _detrended(_late(response, delay))
+                alike, power = float((y * h).sum()), float((h**2).sum())
+                residuals[name, delay, load] = 1.0 - alike / max((energy * power) ** 0.5, 1e-300)
+                scales[name, delay, load] = alike / power
+                if (name, delay, load) == ("nothing", model.delay - model.block, 0):
+                    stated = power
+    return residuals, scales, stated
+
+
+def _responses(model: DeviceModel, drive: Array, finger: Array | None = None) -> Array:
+    """What the sensors show under signal k of a drive (n, 2) on actuator j, shape (2, 2, n, sensors).
+
+    The device is free, or there is a `finger`, given by its displacement per coordinate (c,).
+    """
+    acts = np.zeros(model.mass.shape) if finger is None else np.outer(finger, finger)
+    m, b, k = (part * acts for part in FINGER)
+    plate = DiscretePlant.free(model.mass + m, model.damping + b, model.stiffness + k, model.rate)
+    forces = np.einsum("cj,nk->njkc", plate.b @ model.force_from_drive, drive)
+    states, state = np.empty_like(forces), np.zeros(forces.shape[1:])
     for n, force in enumerate(forces):
         states[n] = state
-        state = plate.a @ state + force
-    return states @ (np.linalg.inv(model.coordinate_from_sensed) @ plate.c).T
+        state = state @ plate.a.T + force
+    return np.moveaxis(states @ (np.linalg.inv(model.coordinate_from_sensed) @ plate.c).T, 0, 2)
 
 
 def _late(response: Array, samples: int) -> Array:

@@ -249,6 +249,8 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
         notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {gain}")
     if touched := _flag_counts(recording)[Flag.TWO_TOUCHES]:
         notes.append(f"more than one finger touched, in {percent(touched / len(recording))} of the samples")
+    if recording.least_scale < 1.0:
+        notes.append(f"the drive's limit scaled the texture to {recording.least_scale:.2g} of it at the least")
     if "[touch_panel]" in header.scene:
         notes.append(
             "the motion is judged against the texture at the recorded position, which the touch panel estimates: its "

@@ -214,6 +214,7 @@ class Recording:
         self.header = header
         self.frames = frames
         self.warnings: tuple[str, ...] = ()  # of the run that has just made it, by its `PlateMismatch`
+        self.least_scale = 1.0  # of that run: by which its law scaled the texture at the least, for the drive's limit
         if scene is not None:
             self.scene = scene
 
