@@ -8,6 +8,8 @@ from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
+from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
+from hapticrender.plants.identify_friction import identify_screen
 from hapticrender.plants.surface import SurfaceParameters
 
 RATE = 5000.0
@@ -18,15 +20,24 @@ FINGERS = {
     "heavy": hr.Finger.sliding(speed=0.12, normal_load=1.0, span=0.26),
 }  # none of them turns within 2 s
 DEVICES = {
-    "ultrasonic, amplitude": ("ultrasonic", {"sensor": "amplitude"}),
-    "ultrasonic, tribometer": ("ultrasonic", {"sensor": "tribometer"}),
-    "screen, tribometer": ("electroadhesion", {}),
+    "ultrasonic, amplitude": ("ultrasonic", {"sensor": "amplitude"}, {}),
+    "ultrasonic, tribometer": ("ultrasonic", {"sensor": "tribometer"}, {}),
+    "screen, dry": ("electroadhesion", {}, {"gap_resistance": DRY}),
+    "screen, normal": ("electroadhesion", {}, {"gap_resistance": NORMAL}),
+    "screen, moist and stated": ("electroadhesion", {"gap_resistance": MOIST}, {}),
+    "screen, moist and identified": ("electroadhesion", None, {"gap_resistance": MOIST}),
 }
 
 
-def white(seconds=2.0):
-    """Noise of 20 to 400 Hz, 3 um rms."""
-    return hr.Recorded(samples=waves.white(round(seconds * RATE), 3e-6, seed=3), rate=RATE, gain=1.0)
+def white(seconds=2.0, rms=3e-6):
+    """Noise of 20 to 400 Hz, `rms` (m)."""
+    return hr.Recorded(samples=waves.white(round(seconds * RATE), rms, seed=3), rate=RATE, gain=1.0)
+
+
+def identified(finger, **simulation):
+    """Profile that identification makes of the screen under the finger that slides over it."""
+    with Screen(blind=False, finger=finger, **simulation) as screen:
+        return identify_screen(screen, ElectroadhesionParameters(), finger).profile()
 
 
 def waveform_error(recording):
@@ -36,12 +47,29 @@ def waveform_error(recording):
 @pytest.mark.parametrize("finger", FINGERS)
 @pytest.mark.parametrize("device", DEVICES)
 def test_white_noise_is_played_whole(device, finger):
-    kind, profile = DEVICES[device]
-    scene = hr.Scene(texture=white(), finger=FINGERS[finger], device=kind, profile=profile, duration=2.0)
-    recording = hr.render(scene)
+    kind, profile, simulation = DEVICES[device]
+    if profile is None:
+        profile = identified(FINGERS[finger], **simulation)
+    fields = {"profile": profile, "simulation": simulation}
+    recording = hr.render(hr.Scene(texture=white(), finger=FINGERS[finger], device=kind, duration=2.0, **fields))
     assert waveform_error(recording) < MUST
     assert recording.waveform["share_in_band"] > 0.99
     assert not (recording.flags & hr.Flag.SATURATED).any()
+
+
+@pytest.mark.parametrize("texture", [white(), white(rms=0.3e-6), hr.Grating(frequency=100.0, velocity=3e-3)])
+@pytest.mark.parametrize("finger", FINGERS)
+def test_a_moist_finger_that_nothing_states_fails_the_verdict(texture, finger):
+    """Its gain is an eighth of the design's: the bias allows twice the swing, so that no law could play it whole."""
+    scene = hr.Scene(
+        texture=texture,
+        finger=FINGERS[finger],
+        device="electroadhesion",
+        simulation={"gap_resistance": MOIST},
+        duration=1.0,
+        keep_unfelt=True,
+    )
+    assert hr.render(scene).summary()["verdict"] == "failed"
 
 
 @pytest.mark.parametrize("area", [0.7, 1.3])
