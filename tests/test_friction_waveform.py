@@ -74,7 +74,7 @@ def test_a_moist_finger_that_nothing_states_fails_the_verdict(texture, finger):
 
 @pytest.mark.parametrize("area", [0.7, 1.3])
 def test_a_finger_with_another_contact_area_is_learned(area):
-    """As well as any other after a second; a gain that is 30 % off would be 30 % of the waveform."""
+    """Within the scene's tolerance after a second; a gain that is 30 % off would be 30 % of the waveform."""
     scene = hr.Scene(
         texture=white(),
         finger=FINGERS["usual"],
@@ -84,7 +84,7 @@ def test_a_finger_with_another_contact_area_is_learned(area):
         settle=1.0,
     )
     recording = hr.render(scene)
-    assert waveform_error(recording) < MUST
+    assert waveform_error(recording) < scene.tolerance == 0.1
     begin = slice(round(0.1 * recording.rate), round(0.3 * recording.rate))
     left = np.diff(recording.motion[begin, 0]) - np.diff(recording.reference[begin])
     assert left.std() > 0.1 * np.diff(recording.reference[begin]).std()  # 2 % where the area is what was believed
@@ -162,7 +162,7 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, learnin
     """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
 
     Open loop the finger is exactly what the design assumes.  What is learned of it anew in every stroke, from a sensor
-    with noise, costs ridges of 0.5 mm 0.31 points: 0.81 % open, 1.12 % closed; of 1 mm 1.22 % both.
+    with noise, costs ridges of 0.5 mm 0.25 points: 0.81 % open, 1.06 % closed; of 1 mm 1.22 % both.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
 

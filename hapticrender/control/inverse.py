@@ -49,8 +49,7 @@ GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
 FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a friction device; and samples of delay
-FRICTION_GAIN = 0.6  # of all three together: the drive's gain is unknown, by the contact's area more than by anything
-FRICTION_NOISE = 0.08  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
+FRICTION_NOISE = 0.05  # N: of a friction that no model explains; a filter surer than that follows its own mistakes
 LOAD_OF_FRICTION = 3.0  # N: of the attraction that a finger's own friction amounts to
 LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
 
@@ -131,10 +130,9 @@ def prior(model: DeviceModel) -> tuple[Array, Array]:
         sigma[COUPLING : COUPLING + 3] = 0.03 * k, c, 0.05 * m
         sigma[LOAD + 1] = LOAD_SIZE[1]
     if model.finger.contact is None:  # friction: the device is what is not known, and no finger adds to it
-        own, gain = np.array([k, model.damping[0, 0] * OMEGA_N, m]), np.zeros(PARAMETERS)
-        sigma[HEAVE : HEAVE + 4] = FRICTION * np.append(own, 1.0)
-        sigma[LOAD], gain[HEAVE : HEAVE + 3] = LOAD_OF_FRICTION, FRICTION_GAIN * own
-        return mean, np.diag(sigma**2) + np.outer(gain, gain)
+        sigma[HEAVE : HEAVE + 4] = FRICTION * np.array([k, model.damping[0, 0] * OMEGA_N, m, 1.0])
+        sigma[LOAD] = LOAD_OF_FRICTION
+        return mean, np.diag(sigma**2)
     covariance = np.diag(sigma**2)
     mean[FINGER:HEAVE], covariance[FINGER:HEAVE, FINGER:HEAVE] = finger_prior(model)
     return mean, covariance
