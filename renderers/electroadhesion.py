@@ -14,14 +14,13 @@ from functools import cached_property
 from hapticrender.checks import inside, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
-from hapticrender.plants.electroadhesion import NORMAL, ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_tables, read_devices
 from hapticrender.renderers.friction import HEADROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene
 
-NOMINAL_GAP = 1.5e-6  # m
 LEVEL = ("level", "oversampling")  # how finely a screen is modelled
 
 
@@ -47,26 +46,21 @@ class ScreenSetup(FrictionSetup):
     simulated: ElectroadhesionParameters
 
     @property
-    def nominal(self) -> ElectroadhesionParameters:
-        """Screen under a nominal finger, as assumed before anything is measured."""
-        return replace(self.assumed, area_scale=1.0, gap_thickness=NOMINAL_GAP, gap_resistance=NORMAL)
-
-    @property
     def open_loop_gain(self) -> float:
-        """Gain g (N/A^2) under a finger that is not sensed: of the profile, else of a nominal one under its load."""
+        """Gain g (N/A^2) under a finger that is not sensed: of the profile, else of its finger under its load."""
         if "open_loop_gain" in self.scene.profile:
             return self.assumed.open_loop_gain
-        return self.nominal.gain(self.load)
+        return self.assumed.gain(self.load)
 
     @cached_property
     def compensation(self) -> SquareRoot:
-        """Square root for a nominal finger under the scene's load, its bias as large as the scene needs."""
-        assumed, settings, finger, load = self.assumed, self.settings, self.nominal, self.load
+        """Square root for the profile's finger under the scene's load, its bias as large as the scene needs."""
+        assumed, settings, load = self.assumed, self.settings, self.load
         limit, unit = assumed.voltage_limit, "V"
         if assumed.drive_kind == "current":
-            limit, unit = min(assumed.current_limit, limit / abs(finger.impedance(load))), "A"
+            limit, unit = min(assumed.current_limit, limit / abs(assumed.impedance(load))), "A"
         limit = min(limit, carrier_limit(self.scene.device_profile.limits))
-        gain = self.open_loop_gain / finger.gain(load) * float(finger.attraction(1.0, load))
+        gain = self.open_loop_gain / assumed.gain(load) * float(assumed.attraction(1.0, load))
         most = gain * limit**2
         swing = settings.headroom * self.needed(self.model(Port(assumed.rate, 1, 1))).drive
         bias = swing / (1.0 - settings.floor)

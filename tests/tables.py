@@ -3,18 +3,18 @@
 import hapticrender as hr
 
 SETTINGS = {"velocity_per_force", "square_root", "headroom", "floor", "output", "crossover"}
-LEVEL = {
+SIMULATED = {
     *("level", "oversampling", "envelope_oversampling", "envelope_frequency"),
-    *("degrees_of_freedom", "finger_dynamics"),
+    *("degrees_of_freedom", "finger_dynamics", "area_scale", "gap_thickness", "gap_resistance"),
 }
 
 
 def tables(parameters):
-    """Fields of a scene: settings of the renderer, model level, and the rest in the device's profile."""
+    """Fields of a scene: settings of the renderer, model level and unknown finger, and the rest in the profile."""
     return {
         "rendering": {name: value for name, value in parameters.items() if name in SETTINGS},
-        "simulation": {name: value for name, value in parameters.items() if name in LEVEL},
-        "profile": {name: value for name, value in parameters.items() if name not in SETTINGS | LEVEL},
+        "simulation": {name: value for name, value in parameters.items() if name in SIMULATED},
+        "profile": {name: value for name, value in parameters.items() if name not in SETTINGS | SIMULATED},
     }
 
 

@@ -8,6 +8,8 @@ from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
+from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
+from hapticrender.plants.identify_friction import identify_screen
 from hapticrender.plants.surface import SurfaceParameters
 
 RATE = 5000.0
@@ -18,15 +20,24 @@ FINGERS = {
     "heavy": hr.Finger.sliding(speed=0.12, normal_load=1.0, span=0.26),
 }  # none of them turns within 2 s
 DEVICES = {
-    "ultrasonic, amplitude": ("ultrasonic", {"sensor": "amplitude"}),
-    "ultrasonic, tribometer": ("ultrasonic", {"sensor": "tribometer"}),
-    "screen, tribometer": ("electroadhesion", {}),
+    "ultrasonic, amplitude": ("ultrasonic", {"sensor": "amplitude"}, {}),
+    "ultrasonic, tribometer": ("ultrasonic", {"sensor": "tribometer"}, {}),
+    "screen, dry": ("electroadhesion", {}, {"gap_resistance": DRY}),
+    "screen, normal": ("electroadhesion", {}, {"gap_resistance": NORMAL}),
+    "screen, moist and stated": ("electroadhesion", {"gap_resistance": MOIST}, {}),
+    "screen, moist and identified": ("electroadhesion", None, {"gap_resistance": MOIST}),
 }
 
 
-def white(seconds=2.0):
-    """Noise of 20 to 400 Hz, 3 um rms."""
-    return hr.Recorded(samples=waves.white(round(seconds * RATE), 3e-6, seed=3), rate=RATE, gain=1.0)
+def white(seconds=2.0, rms=3e-6):
+    """Noise of 20 to 400 Hz, `rms` (m)."""
+    return hr.Recorded(samples=waves.white(round(seconds * RATE), rms, seed=3), rate=RATE, gain=1.0)
+
+
+def identified(finger, **simulation):
+    """Profile that identification makes of the screen under the finger that slides over it."""
+    with Screen(blind=False, finger=finger, **simulation) as screen:
+        return identify_screen(screen, ElectroadhesionParameters(), finger).profile()
 
 
 def waveform_error(recording):
@@ -36,12 +47,29 @@ def waveform_error(recording):
 @pytest.mark.parametrize("finger", FINGERS)
 @pytest.mark.parametrize("device", DEVICES)
 def test_white_noise_is_played_whole(device, finger):
-    kind, profile = DEVICES[device]
-    scene = hr.Scene(texture=white(), finger=FINGERS[finger], device=kind, profile=profile, duration=2.0)
-    recording = hr.render(scene)
+    kind, profile, simulation = DEVICES[device]
+    if profile is None:
+        profile = identified(FINGERS[finger], **simulation)
+    fields = {"profile": profile, "simulation": simulation}
+    recording = hr.render(hr.Scene(texture=white(), finger=FINGERS[finger], device=kind, duration=2.0, **fields))
     assert waveform_error(recording) < MUST
     assert recording.waveform["share_in_band"] > 0.99
     assert not (recording.flags & hr.Flag.SATURATED).any()
+
+
+@pytest.mark.parametrize("texture", [white(), white(rms=0.3e-6), hr.Grating(frequency=100.0, velocity=3e-3)])
+@pytest.mark.parametrize("finger", FINGERS)
+def test_a_moist_finger_that_nothing_states_fails_the_verdict(texture, finger):
+    """Its gain is an eighth of the design's: the bias allows twice the swing, so that no law could play it whole."""
+    scene = hr.Scene(
+        texture=texture,
+        finger=FINGERS[finger],
+        device="electroadhesion",
+        simulation={"gap_resistance": MOIST},
+        duration=1.0,
+        keep_unfelt=True,
+    )
+    assert hr.render(scene).summary()["verdict"] == "failed"
 
 
 @pytest.mark.parametrize("area", [0.7, 1.3])
@@ -87,23 +115,29 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
     assert after.std() < MUST * size
 
 
-def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know():
-    """True friction is the law's, of the true amplitude; what the recording infers is within a point of it."""
-    device = watched()
-    scene = hr.Scene(texture=white(0.6), finger=FINGERS["usual"], device="ultrasonic", duration=0.6, settle=0.2)
+@pytest.mark.parametrize(("speed", "rms", "bound"), [(0.01, 0.5e-6, 0.05), (0.03, 3e-6, MUST), (0.1, 3e-6, MUST)])
+def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound):
+    """True friction is the law's, of the true amplitude; what the recording infers is within a point of it.
+
+    Where the true friction is half as large again, half of the texture is wrong, and not judged.
+    """
+    finger = hr.Finger.sliding(speed=speed, normal_load=0.4, span=0.18)
+    device = watched(finger)
+    scene = hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", duration=0.6, settle=0.2)
     recording = hr.render(scene, driver=device)
     p, steps = SurfaceParameters(), round(192e3 / recording.rate)
     amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
-    film = p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, 0.08)
-    kept = np.exp(-0.08 / 192e3 / p.memory_length)
+    film = p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, speed)
+    kept = np.exp(-speed / 192e3 / p.memory_length)
     true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
     band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
     late = slice(round(0.2 * recording.rate), round(0.55 * recording.rate))
     signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
     true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
-    errors = [np.std(each - reference) / np.std(reference) for each in (true, inferred)]
-    assert max(errors) < MUST
-    assert abs(errors[0] - errors[1]) < 0.01
+    right, shown, wrong = (np.std(each - reference) / np.std(reference) for each in (true, inferred, 1.5 * true))
+    assert right < bound
+    assert abs(right - shown) < 0.01
+    assert wrong == pytest.approx(0.5, abs=2 * bound)  # half of a texture that is right within the bound
     summary = recording.summary()
     assert summary["verdict"] == "not judged"
     assert "inferred by a law that is assumed" in summary["reason"]
@@ -123,8 +157,13 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     assert recording.summary()["verdict"] != "passed"
 
 
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
-    """Ridges of 1 mm under swipes at 3 Hz: the sign turns with the finger, the friction does not."""
+@pytest.mark.parametrize(("wavelength", "learning"), [(1e-3, 0.0005), (0.5e-3, 0.005)])
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, learning):
+    """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
+
+    Open loop the finger is exactly what the design assumes.  What is learned of it anew in every stroke, from a sensor
+    with noise, costs ridges of 0.5 mm 0.25 points: 0.81 % open, 1.06 % closed; of 1 mm 1.22 % both.
+    """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
 
     def signed(sample, sensed):
@@ -135,10 +174,14 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
     late = slice(5000, 9_500)
     for blind in (True, False):
         screen = Screen(blind=blind, finger=finger, tell=signed)
+<<<<<<< HEAD
         scene = hr.Scene(texture=ridges(), finger=finger, device="electroadhesion", duration=1.0)
+=======
+        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.5)
+>>>>>>> friction
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors[blind] = np.std(played - asked) / np.std(asked)
-    assert errors[True] < MUST
-    assert errors[False] < max(errors[True], 0.02)
+    assert max(errors.values()) < 0.02
+    assert errors[False] < errors[True] + learning

@@ -8,7 +8,7 @@ import pytest
 from electroadhesive import tone as friction_tone
 from finger_data import make_impedance
 from synthetic import make_bands, make_recording
-from tables import LEVEL, scene_on, tables
+from tables import SIMULATED, scene_on, tables
 from test_kernel import plate_controller
 from waves import Own
 
@@ -428,7 +428,7 @@ def test_every_name_is_listed_once_in_order_and_accepted(device):
     known = known_of(device)
     assert set(known) >= ONE_EACH[device]
     for name, table in known.items():
-        field = "rendering" if table == "render" else "simulation" if name in LEVEL else "profile"
+        field = "rendering" if table == "render" else "simulation" if name in SIMULATED else "profile"
         with pytest.raises((TypeError, ValueError), match="must be") as refused:
             opened_on(device, **{field: {name: "no such option"}})
         assert re.search(rf"\b{re.sub('^(plate|screen)_', '', name)} = 'no such option'", str(refused.value))

@@ -1,0 +1,111 @@
+"""Sensors of friction devices that fail during a run through `render`: what is stopped, how soon, and what is not."""
+
+import numpy as np
+import pytest
+from electroadhesive import Screen
+from test_ultrasonic_rendering import watched
+
+import hapticrender as hr
+from hapticrender.plants.ultrasonic import UltrasonicParameters
+
+START = 0.3  # s: when the sensor fails
+ZERO = 2e-3  # s from the stop to zero drive
+FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
+DEVICES = {"ultrasonic": watched, "electroadhesion": lambda finger, tell: Screen(blind=False, finger=finger, tell=tell)}
+FAULTS = {  # what is sensed instead of `sensed`, of which `last` was the last sample
+    "healthy": lambda sensed, last, rng: sensed,
+    "frozen": lambda sensed, last, rng: np.broadcast_to(last, sensed.shape),
+    "dead": lambda sensed, last, rng: 0.0 * sensed,
+    "no numbers": lambda sensed, last, rng: np.nan * sensed,
+    "inverted": lambda sensed, last, rng: -sensed,
+    "noise": lambda sensed, last, rng: 1e-9 * rng.standard_normal(sensed.shape),
+}
+
+
+def spoiled(kind, fault):
+    """A device whose sensor fails at `START`."""
+    rng, last = np.random.default_rng(1), [0.0]
+
+    def tell(sample, sensed):
+        if sample < START * device.rate:
+            last[0] = sensed.sensed[-1].copy()
+            return sensed._replace(motion=None)
+        return sensed._replace(sensed=FAULTS[fault](sensed.sensed, last[0], rng), motion=None)
+
+    device = DEVICES[kind](FINGER, tell=tell)
+    return device
+
+
+def run(kind, fault):
+    """Run 0.6 s: the device, the scene, its recording, and what stopped it, or None."""
+    device = spoiled(kind, fault)
+    scene = hr.Scene(texture=hr.Grating(frequency=100.0, velocity=10e-3), finger=FINGER, device=kind, duration=0.6)
+    try:
+        return device, scene, hr.render(scene, driver=device), None
+    except hr.DeviceFault as found:
+        return device, scene, found.recording, found
+
+
+def largest(blocks, rate):
+    """Largest magnitude before `START`, from 0.1 s on, and after it."""
+    values, at = abs(np.concatenate(blocks)[:, 0]), round(START * rate)
+    return values[round(0.1 * rate) : at].max(), values[at:].max()
+
+
+STOPPED = [  # and within which time (s)
+    ("ultrasonic", "frozen", 0.1e-3, "one value repeats"),
+    ("ultrasonic", "dead", 0.1e-3, "one value repeats"),
+    ("ultrasonic", "no numbers", 8e-3, "samples are no numbers"),
+    ("ultrasonic", "inverted", 4e-3, "the drive stayed above what any finger needs"),
+    ("ultrasonic", "noise", 4e-3, "the drive stayed above what any finger needs"),
+    ("electroadhesion", "frozen", 8e-3, "one value repeats"),
+    ("electroadhesion", "dead", 8e-3, "one value repeats"),
+    ("electroadhesion", "no numbers", 8e-3, "samples are no numbers"),
+]
+
+
+@pytest.mark.parametrize(("kind", "fault", "within", "cause"), STOPPED)
+def test_a_sensor_that_fails_is_stopped(kind, fault, within, cause):
+    """Zero drive within 10 ms of the fault, a screen's bias included; the sample at the end of the fade is the last.
+
+    The amplitude grows by N u/(2 m w) at most, u the largest drive.
+    """
+    device, _, recording, found = run(kind, fault)
+    assert found is not None
+    assert cause in str(found)
+    assert START <= found.time <= START + within
+    assert recording.flags[-1] & hr.Flag.STOPPED
+    drive = np.concatenate(device.played)[:, 0]
+    assert not drive[round((found.time + ZERO) * device.rate) + 1 :].any()
+    before, after = largest(device.moved, device.rate)
+    quiet, loud = largest(device.played, device.rate)
+    if kind == "electroadhesion":
+        assert loud <= quiet
+        assert after <= before
+    else:
+        p = UltrasonicParameters()
+        slope = p.force_constant * loud / (4 * np.pi * p.frequency * p.modal_mass)
+        assert loud <= p.drive_limit
+        assert after < before + slope * (found.time - START + ZERO / 10)
+
+
+@pytest.mark.parametrize(("fault", "verdict"), [("healthy", "passed"), ("inverted", "passed"), ("noise", "failed")])
+def test_a_tribometer_that_is_inverted_or_dies_into_noise_is_not_stopped(fault, verdict):
+    """Friction is a magnitude; of noise nothing is found, and the square root bounds the drive."""
+    device, scene, recording, found = run("electroadhesion", fault)
+    assert found is None
+    assert recording.summary()["verdict"] == verdict
+    shape = hr.prepare(scene, driver=spoiled("electroadhesion", fault)).driver.shape
+    before, after = largest(device.played, device.rate)
+    assert after <= shape(shape.bias - shape.floor) < 1.2 * before
+    if fault != "noise":
+        assert after == pytest.approx(before, rel=0.01)
+
+
+def test_a_healthy_ultrasonic_surface_is_not_stopped():
+    device, _, recording, found = run("ultrasonic", "healthy")
+    assert found is None
+    assert not (recording.flags & hr.Flag.STOPPED).any()
+    for blocks in (device.played, device.moved):
+        before, after = largest(blocks, device.rate)
+        assert after == pytest.approx(before, rel=0.01)
