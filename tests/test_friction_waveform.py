@@ -174,11 +174,7 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, learnin
     late = slice(5000, 9_500)
     for blind in (True, False):
         screen = Screen(blind=blind, finger=finger, tell=signed)
-<<<<<<< HEAD
-        scene = hr.Scene(texture=ridges(), finger=finger, device="electroadhesion", duration=1.0)
-=======
-        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.5)
->>>>>>> friction
+        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.0)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
