@@ -139,7 +139,8 @@ class NaiveInverse:
     def learn(self, i, dev):
         psi, dev_u = self.psi[i, :COUNT], self.psi[i, COUNT]
         e = dev - dev_u + psi @ self.theta
-        self.size[i] += self.law["mean_square_pole"] * (dev_u**2 + 10.0 * e**2 - self.size[i])
+        square = dev_u**2 + self.law["deviations"] * dev**2 + self.law["innovations"] * e**2
+        self.size[i] += self.law["mean_square_pole"] * (square - self.size[i])
         noise = self.law["noise"][i] + self.law["model_error"] * self.size[i]
         gain = self.P @ psi / (psi @ self.P @ psi + noise)
         self.theta = self.theta - gain * e

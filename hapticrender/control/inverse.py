@@ -42,6 +42,7 @@ LEARNING_DELAY, RELEARNING_DELAY, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a cont
 INITIAL_TIME = 60e-3  # s, from the second start of learning on: the deviation at that start is a parameter
 LOSS_TIME = 1e-3  # s without a position, by which a contact is lost
 MODEL_ERROR = 0.1  # of what the drive explains of a deviation: part that no parameter explains
+INNOVATIONS = 10.0  # weight of their mean square beside it: a tenth is noise; on friction devices of the deviation's
 LEAST_NOISE = 5e-5  # of the sensors' range
 REPORT_DELAY = 10e-3  # s: a contact is reported within this
 HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
@@ -238,6 +239,8 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
         "damper_time": round(DAMPER_TIME * model.rate),
         "loss_time": round(LOSS_TIME * model.rate),
         "model_error": MODEL_ERROR**2,
+        "deviations": float(friction),
+        "innovations": 0.0 if friction else INNOVATIONS,
         "report_delay": max(round(REPORT_DELAY * model.rate), 1),
         "gate_threshold": (GATE_SIGMAS * noise) ** 2,
         "high_pass_pole": -math.expm1(-2 * math.pi * 20.0 * period),

@@ -26,7 +26,6 @@ from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.mathx import TURN
 
 FARTHEST_LEVER = 2.0  # no surface is longer
-INNOVATIONS = 10.0  # weight of their mean square in `model_power`: a tenth of it is noise
 UNREPORTED = 15e3  # N/m, of the coupling, for a finger whose place is not known yet: 12 N s/m or 10 g, the prior's most
 
 
@@ -246,7 +245,7 @@ def learn(inverse, coordinate, error):
     innovation = error - explained
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
-    square = explained * explained + INNOVATIONS * innovation * innovation
+    square = explained * explained + v.deviations * error * error + v.innovations * innovation * innovation
     v.model_power[coordinate] += v.mean_square_pole * (square - v.model_power[coordinate])
     scatter = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
     for i in range(PARAMETERS):

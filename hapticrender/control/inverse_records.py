@@ -41,6 +41,7 @@ INVERSE = np.dtype(
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
         ("noise", np.float64, (2,)),  # variances of heave and rocking: 6 (sensor noise)^2, first part of sigma_e^2
+        *((name, np.float64) for name in ("deviations", "innovations")),  # weights of mean squares in `model_power`
         ("model_error", np.float64),  # part of `model_power` in sigma_e^2
         ("prior", np.float64, (ROWS - 1,)),  # mean
         ("prior_covariance", np.float64, (ROWS - 1, ROWS - 1)),
@@ -51,7 +52,7 @@ INVERSE = np.dtype(
         *((name, np.int64) for name in ("sample", "ring_at", "reference_at")),
         ("window", np.float64, (TAPS,)),  # references around the moment at which this sample's drive acts, oldest first
         ("sensor_window", np.float64, (TAPS,)),  # around now, for what the sensors should show
-        ("model_power", np.float64, (2,)),  # mean squares of what the drive explains, and ten times of the innovations
+        ("model_power", np.float64, (2,)),  # mean squares of what the drive explains, deviations and innovations
         ("poles", np.float64, (2,)),
         ("basis", np.float64, (BASIS,)),
         ("theta", np.float64, (ROWS - 1,)),

@@ -246,6 +246,7 @@ class Plate(CompiledPlant):
         super().__init__(finger, parameters.rate, delay=parameters.delay, block=block, seed=seed)
         self.parameters, self._mechanics = parameters, finger.mechanics
         self.buffers = (np.zeros((self.delay - block, parameters.coils)),)
+        structure(parameters, finger.mechanics)  # refuses what cannot be
         for function in FUNCTIONS.values():
             function.expect()
 
