@@ -157,8 +157,10 @@ class LiveLoop(RealtimeEntry):
         if state == self._foreseen[1] and sample < self._foreseen[0] + REFRESH * self.driver.rate:
             return
         self._foreseen = sample, state
+        faded = int(entry["switch"][0]) + max(int(entry[name][0]) for name in ("fade", "fade_out"))
+        audible = ("current", "previous") if sample < faded else ("current",)  # before its fade one may have failed
         for texture in playing:
-            if texture.address in state:
+            if texture.address in [int(entry[name][0]) for name in audible]:
                 texture.foresee(sample, path)
 
     @property

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -58,8 +59,10 @@ class Starter(Listener):
         import subprocess
 
         names = sorted(EXPECTED)
-        python = Path(sys.executable or "").name.lower().startswith("python")  # else a program with Python inside
-        if not names or not python or multiprocessing.parent_process() or (os.cpu_count() or 1) < 2:
+        python = re.fullmatch(r"pythonw?[\d.]*t?(\.exe)?", Path(sys.executable or "").name.lower())
+        own = not python or hasattr(sys, "frozen")  # a program with Python inside
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        if not names or own or multiprocessing.parent_process() or cores < 2:
             return
         EXPECTED.clear()
         command, silent = [sys.executable, "-c", CODE.format(path=sys.path, names=names)], subprocess.DEVNULL

@@ -120,7 +120,7 @@ class Stubborn(Own):
 
 
 def test_it_fades_into_others_and_back_under_a_callback(tmp_path):
-    """Also ridges in a playlist beside a tone; nothing is flagged, whatever follows what."""
+    """Also ridges in a playlist beside a tone; nothing stops the drive, whatever follows what."""
     ridges = hr.Playlist([(hr.Grating(wavelength=1e-3, amplitude=5e-6), 0.3), (TONE, 0.3)]) + TONE
     with hr.Player(driver=Calling()) as player:
         targets = []
@@ -132,6 +132,19 @@ def test_it_fades_into_others_and_back_under_a_callback(tmp_path):
     assert [targets[0], targets[3]] == pytest.approx([5e-6, 5e-6], rel=1e-3)
     assert targets[1] == pytest.approx(5e-6 / np.sqrt(2), rel=0.05)  # rms; words come when the application is awake
     assert targets[2] > 0.9 * 5e-6 / np.sqrt(2)
+
+
+def test_a_texture_that_was_replaced_is_evaluated_no_more():
+    """What it raises once it has faded out is no fault of the texture that plays."""
+    at = threading.Event()
+    with hr.Player(driver=Calling()) as player:
+        player.play(Stubborn(1e3, 200.0, at=at, fails=True))
+        player.sleep(0.3)
+        player.play(TONE)
+        player.sleep(0.3)  # its fade is over
+        at.set()
+        player.sleep(0.5)
+        assert player.state().flags & hr.Flag.STOPPED == 0
 
 
 def test_a_texture_that_takes_longer_than_a_piece_lasts_is_flagged():

@@ -90,15 +90,21 @@ def started(_=None):
 def nothing_expected(monkeypatch):
     monkeypatch.setattr(second_core, "EXPECTED", set())
     monkeypatch.setattr(second_core, "CHILDREN", {})
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(2), raising=False)
 
 
 def test_no_child_without_a_second_core_or_an_interpreter(nothing_expected, monkeypatch, tmp_path):
     assert started()
-    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(1), raising=False)
     assert not started()
-    monkeypatch.setattr(os, "cpu_count", lambda: 2)
-    for executable in (None, "", str(tmp_path / "blender"), str(tmp_path / "python-that-is-not-there")):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: range(2), raising=False)
+    for executable in (
+        None,
+        "",
+        str(tmp_path / "blender"),
+        str(tmp_path / "python-audio-app"),
+        str(tmp_path / "python3.99"),
+    ):
         monkeypatch.setattr(sys, "executable", executable)
         assert not started()
 
