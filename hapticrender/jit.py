@@ -26,7 +26,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from hapticrender.second_core import expect, shared
+from hapticrender.second_core import EXPECTED, await_child, expect, start_child
 
 # no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of
 # a part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
@@ -84,8 +84,9 @@ def entry(function: Callable[..., Any]) -> Any:
         return numba.njit(function, **OPTIONS)
 
 
-def announce() -> None:
-    """Print once a process that something is being compiled."""
+def compiling() -> None:
+    """Start compiling on a second core too, and print once a process that something is being compiled."""
+    start_child()
     if not ANNOUNCED.is_set():
         ANNOUNCED.set()
         print("compiling for this machine (once)", file=sys.stderr, flush=True)
@@ -108,16 +109,17 @@ class CFunction:
 
     @cached_property
     def _compiled(self) -> Any:
-        note = threading.Timer(ANNOUNCED_AFTER, announce)
-        note.daemon = True
-        note.start()
+        await_child(self.function)
+        slow = threading.Timer(ANNOUNCED_AFTER, compiling)
+        slow.daemon = True
+        slow.start()
         try:
-            with shared(self.function):
-                return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
+            return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
         except RuntimeError:
+            EXPECTED.clear()  # without a cache a child's work is of no use
             return numba.cfunc(self.signature, **OPTIONS)(self.function)
         finally:
-            note.cancel()
+            slow.cancel()
 
     def expect(self) -> None:
         """Announce that the address is needed soon, for it to be compiled beside what is needed before."""

@@ -284,9 +284,8 @@ PACKAGES = ("numba", "llvmlite")
 TYPES = "int32 int64 uint32 uint64 float32 float64 complex128 boolean Float Integer Type CPointer".split()
 EXTENSION = "intrinsic lower_builtin models models.PrimitiveModel register_model type_callable".split()
 IR = "Constant DoubleType Function FunctionType IntType LiteralStructType PointerType Undefined VectorType".split()
-ALLOWED = {  # numba's user manual, extension manual and event API, llvmlite's manual of its IR layer
+ALLOWED = {  # numba's user manual, extension manual, llvmlite's manual of its IR layer
     *("numba.njit", "numba.cfunc", "numba.carray", "numba.from_dtype", "numba.types"),
-    *("numba.core.event.Listener", "numba.core.event.install_listener"),
     *(f"numba.extending.{name}" for name in EXTENSION),
     *(f"numba.types.{name}" for name in TYPES),
     *("llvmlite.ir", *(f"llvmlite.ir.{name}" for name in IR)),
