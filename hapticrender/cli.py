@@ -13,11 +13,13 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hapticrender import __version__, defaults, verbs
+from hapticrender import __version__, defaults
 from hapticrender.errors import HapticError
+from hapticrender.formatting import printable
 
 _DESCRIPTION = "Render a texture for a finger on a surface, in closed loop, on a device or on a model of one."
 _EXAMPLES = """\
@@ -56,17 +58,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
-        return verbs.fail("interrupted; what is written so far can be read", 130)
+        return fail("interrupted; what is written so far can be read", 130)
     except (MemoryError, OSError, ValueError, HapticError) as error:
         if sys.flags.dev_mode:
             traceback.print_exception(error)
-        return verbs.fail(_line(error), 2)
+        return fail(_line(error), 2)
+
+
+def fail(message: str, status: int) -> int:
+    """Write exactly one line to standard error and return the exit status."""
+    print(f"hapticrender: {printable(' '.join(message.split()))}", file=sys.stderr)
+    return status
 
 
 def _run(arguments: argparse.Namespace) -> int:
     """Run a verb; what ends the program within, other than a signal, is an error, whatever status it gives."""
+    if arguments.verb is None:
+        _parser().print_help()
+        return 0
     try:
-        return arguments.run(arguments)  # type: ignore[no-any-return]
+        verb = getattr(import_module("hapticrender.verbs"), arguments.verb)  # which takes a second to import
+        return verb(arguments)  # type: ignore[no-any-return]
     except SystemExit as error:
         from hapticrender.loop import Terminated
 
@@ -91,8 +103,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"hapticrender {__version__}")
-    parser.set_defaults(run=lambda _: print(parser.format_help(), end="") or 0)
-    choices = parser.add_subparsers(title="verbs", metavar="VERB")
+    choices = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
     for add in (_add_players, _add_checks, _add_measurements, _add_lists):
         add(choices)
     return parser
@@ -101,11 +112,11 @@ def _parser() -> argparse.ArgumentParser:
 def _add_players(choices: Any) -> None:
     """Add the verbs that play scenes."""
     text = "render the built-in scenes and make a page of sounds, pictures and figures"
-    demo = _add_verb(choices, "demo", verbs.demo, text)
+    demo = _add_verb(choices, "demo", text)
     _add_out(demo, default=Path("out/demo"))
     _add_run(demo, driver=False)
 
-    render = _add_verb(choices, "render", verbs.render, "render one scene into a folder")
+    render = _add_verb(choices, "render", "render one scene into a folder")
     _add_scene(render)
     _add_out(render, required=True)
     _add_run(render)
@@ -113,7 +124,7 @@ def _add_players(choices: Any) -> None:
     render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
 
     text = "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags"
-    play = _add_verb(choices, "play", verbs.play, text)
+    play = _add_verb(choices, "play", text)
     _add_scene(play)
     play.add_argument("--seconds", metavar="S", type=float, help="how long (default: the scene's duration)")
     _add_out(play)
@@ -122,7 +133,7 @@ def _add_players(choices: Any) -> None:
 
 def _add_checks(choices: Any) -> None:
     """Add the verbs that judge."""
-    validate = _add_verb(choices, "validate", verbs.validate, "render scenes and exit 1 when one misses its tolerance")
+    validate = _add_verb(choices, "validate", "render scenes and exit 1 when one misses its tolerance")
     validate.epilog = (
         "Exit status: 0 no scene misses its tolerance, 1 one does, 2 one cannot be rendered, or a report not written.  "
         "A scene that cannot be judged is counted, skipped in JUnit, and no pass in JSON."
@@ -140,14 +151,14 @@ def _add_checks(choices: Any) -> None:
     validate.add_argument("--strict", action="store_true", help="exit 1 also where a scene is not judged")
     _add_run(validate)
 
-    show = _add_verb(choices, "show", verbs.show, "print the figures of a recording, finished or cut off by a crash")
+    show = _add_verb(choices, "show", "print the figures of a recording, finished or cut off by a crash")
     show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
 
 
 def _add_measurements(choices: Any) -> None:
     """Add the verbs that measure a device, or the finger on it, and the one that exports a controller."""
     text = "measure the finger in a recording of a plate: load, position, contact, impedance"
-    finger = _add_verb(choices, "finger", verbs.finger, text)
+    finger = _add_verb(choices, "finger", text)
     finger.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
     text = "profile (TOML) of the plate, as identify writes it (default: that of the scene of the recording)"
     finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
@@ -158,7 +169,7 @@ def _add_measurements(choices: Any) -> None:
     _add_out(finger, required=True)
 
     text = "identify a plate or an ultrasonic surface without a finger, or a screen"
-    identify = _add_verb(choices, "identify", verbs.identify, text)
+    identify = _add_verb(choices, "identify", text)
     text = "scene whose [device] is the expected one, and [simulation] the simulated one (default: the paper's plate)"
     identify.add_argument("--scene", metavar="SCENE", help=text)
     text = "of a glass end (default: 100e-6)"
@@ -171,7 +182,7 @@ def _add_measurements(choices: Any) -> None:
     _add_run(identify, method=False)
 
     text = "measure the delay of a loop by a cable from a driver's first output to its first input"
-    latency = _add_verb(choices, "latency", verbs.latency, text)
+    latency = _add_verb(choices, "latency", text)
     latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
     text = "runs, which must agree (default: 5)"
     latency.add_argument("--runs", metavar="N", type=_whole(1, 999), default=5, help=text)
@@ -180,7 +191,7 @@ def _add_measurements(choices: Any) -> None:
     text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
     latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
 
-    export = _add_verb(choices, "export", verbs.export, "write a scene's controller as C sources for a microcontroller")
+    export = _add_verb(choices, "export", "write a scene's controller as C sources for a microcontroller")
     _add_scene(export)
     text = "most bands that the board can be set to (default: 8, or as many as the scene has)"
     export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
@@ -189,16 +200,15 @@ def _add_measurements(choices: Any) -> None:
 
 def _add_lists(choices: Any) -> None:
     """Add the verbs that list."""
-    scenes = _add_verb(choices, "scenes", verbs.scenes, "list the built-in scenes, or print one as TOML")
+    scenes = _add_verb(choices, "scenes", "list the built-in scenes, or print one as TOML")
     scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
     text = "list kinds of device, drivers, and the cards and ports that are there"
-    _add_verb(choices, "devices", verbs.devices, text)
+    _add_verb(choices, "devices", text)
 
 
-def _add_verb(choices: Any, name: str, run: Any, text: str) -> argparse.ArgumentParser:
-    verb = choices.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")
-    verb.set_defaults(run=run)
-    return verb
+def _add_verb(choices: Any, name: str, text: str) -> argparse.ArgumentParser:
+    """Add the verb that a function of this name in `hapticrender.verbs` runs."""
+    return choices.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")  # type: ignore[no-any-return]
 
 
 def _add_scene(verb: argparse.ArgumentParser) -> None:

@@ -6,32 +6,34 @@ import argparse
 import shlex
 import sys
 from dataclasses import replace
+from datetime import date
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hapticrender import __version__, defaults
+from hapticrender import validate as validation
+from hapticrender.checks import number
+from hapticrender.cli import fail
 from hapticrender.devices import SIMULATED, imported, naming_driver, open_driver, registered
 from hapticrender.devices import text as devices_text
 from hapticrender.errors import naming
 from hapticrender.formatting import printable, table
+from hapticrender.loop import prepare
+from hapticrender.player import Player
+from hapticrender.protocols import Rendering
+from hapticrender.recordings.recording import Recording
+from hapticrender.report import outputs
+from hapticrender.report.outputs import check_file, check_folder
+from hapticrender.report.page import write_page
+from hapticrender.report.progress import progress
 from hapticrender.report.text import conditions, describe, figures, overview, verdict
-
-if TYPE_CHECKING:
-    from hapticrender.protocols import Rendering
-    from hapticrender.recordings.recording import Recording
-    from hapticrender.report.outputs import Outputs
-    from hapticrender.touch.device_profile import DeviceProfile
-    from hapticrender.touch.scene import Scene
+from hapticrender.touch.builtin_scenes import builtin_scenes
+from hapticrender.touch.device_profile import DeviceProfile
+from hapticrender.touch.scene import Scene
 
 LOOK = 0.25  # s between two looks at what plays
 PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapticrender[plot]"'
-
-
-def fail(message: str, status: int) -> int:
-    """Write exactly one line to standard error and return the exit status."""
-    print(f"hapticrender: {printable(' '.join(message.split()))}", file=sys.stderr)
-    return status
 
 
 def _made(path: Path) -> Path:
@@ -40,29 +42,25 @@ def _made(path: Path) -> Path:
     return path
 
 
-def _check_run_folder(folder: Path, arguments: argparse.Namespace, source: Path | None = None) -> None:
-    """Refuse a folder that cannot be written, or, without ``--force``, that holds files of others."""
-    from hapticrender.report.outputs import check_folder, refuse_to_overwrite
+def _check_run_folders(folders: list[Path], arguments: argparse.Namespace, source: Path | None = None) -> None:
+    """Refuse folders that cannot be written, or, without ``--force``, that hold files of others, or a page of others.
 
-    check_folder("--out", folder)
-    if not arguments.force:
-        refuse_to_overwrite(folder, source)
+    The page is in the folder of ``--out``, where `folders` are below it.
+    """
+    for folder in folders:
+        check_folder("--out", folder)
+        if not arguments.force:
+            outputs.refuse_to_overwrite(folder, source)
+            if folder != arguments.out:
+                outputs.refuse_other_page(arguments.out)
 
 
 def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
-    from hapticrender.report import outputs
-    from hapticrender.report.page import write_page
-    from hapticrender.report.progress import progress
-    from hapticrender.touch.builtin_scenes import builtin_scenes
-
     scenes = builtin_scenes()
-    for name in scenes:
-        _check_run_folder(arguments.out / name, arguments)
-    if not arguments.force:
-        outputs.refuse_other_page(arguments.out)
+    _check_run_folders([arguments.out / name for name in scenes], arguments)
     renderings = _prepare(scenes, arguments)
-    finished: list[Outputs] = []
+    finished: list[outputs.Outputs] = []
     try:
         for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
             with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
@@ -77,11 +75,8 @@ def demo(arguments: argparse.Namespace) -> int:
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
-    from hapticrender.report.outputs import run_into, written_in
-    from hapticrender.report.progress import progress
-
     scene, notes = _scene(arguments.scene), ""
-    _check_run_folder(arguments.out, arguments, Path(arguments.scene))
+    _check_run_folders([arguments.out], arguments, Path(arguments.scene))
     with naming(arguments.scene):
         if arguments.least_model:
             from hapticrender.plants.levels import least_model
@@ -91,14 +86,13 @@ def render(arguments: argparse.Namespace) -> int:
         driver = _driver(arguments.driver, scene, arguments.force)
     [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
     with progress(f"1/1 {arguments.scene}", sys.stderr) as tick, naming_driver(arguments.driver):
-        outputs = run_into(arguments.out, rendering, progress=tick)
+        summary = outputs.run_into(arguments.out, rendering, progress=tick).summary
     if arguments.verbose:
-        _print_figures(outputs.summary)
+        _print_figures(summary)
         notes = "\n".join(filter(None, [getattr(rendering.controller(), "note", ""), notes]))
     else:
-        lines = [f"{scene.name} on {scene.device}: {verdict(outputs.summary)}", *outputs.summary["notes"]]
-        print(printable("\n".join(lines)))
-    _print_written(written_in(arguments.out))
+        print(printable("\n".join([f"{scene.name} on {scene.device}: {verdict(summary)}", *summary["notes"]])))
+    _print_written(outputs.written_in(arguments.out))
     if notes:
         print(notes)
     return 0
@@ -106,19 +100,12 @@ def render(arguments: argparse.Namespace) -> int:
 
 def play(arguments: argparse.Namespace) -> int:
     """Play a scene live, with a line for every band: target, achieved and flags."""
-    from hapticrender.checks import number
-    from hapticrender.player import Player
-    from hapticrender.report import outputs
-    from hapticrender.report.page import write_page
-
     scene, out = _scene(arguments.scene), arguments.out
     changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
     scene = replace(scene, **changes)
     seconds = number("--seconds", scene.duration if arguments.seconds is None else arguments.seconds, "s", above=0.0)
     if out:
-        _check_run_folder(out / scene.name, arguments)
-        if not arguments.force:
-            outputs.refuse_other_page(out)
+        _check_run_folders([out / scene.name], arguments)
     journal, above, second = None, 0, 0
     try:
         with (
@@ -148,8 +135,6 @@ def play(arguments: argparse.Namespace) -> int:
 
 def scenes(arguments: argparse.Namespace) -> int:
     """List the built-in scenes, or print one."""
-    from hapticrender.touch.builtin_scenes import builtin_scenes
-
     scenes = builtin_scenes()
     if arguments.scene is None:
         print(table([[name, describe(scene)] for name, scene in scenes.items()]))
@@ -164,11 +149,10 @@ def validate(arguments: argparse.Namespace) -> int:
     """Render scenes, or the accuracy suite; exit status 1 where one misses its tolerance (--strict: is not judged)."""
     if arguments.suite:
         return _suite(arguments)
-    from hapticrender.report.outputs import check_file, check_folder
-    from hapticrender.touch.builtin_scenes import builtin_scenes
-    from hapticrender.validate import counted, exit_status, validate, write_json, write_junit
-
-    reports = [("--json", arguments.json, write_json), ("--junit", arguments.junit, write_junit)]
+    reports = [
+        ("--json", arguments.json, validation.write_json),
+        ("--junit", arguments.junit, validation.write_junit),
+    ]
     references = arguments.scenes or list(builtin_scenes())
     for option, path, _ in reports:
         if path:
@@ -177,16 +161,15 @@ def validate(arguments: argparse.Namespace) -> int:
                 raise ValueError(f"{option} = {str(path)!r}: is a scene, must be another file")
     if arguments.out:
         check_folder("--out", arguments.out)
-    options = {"method": arguments.method, "seed": arguments.seed, "jobs": arguments.jobs, "out": arguments.out}
-    options["driver"] = arguments.driver
-    verdicts = validate(references, **options, progress=sys.stderr)
+    options = {name: getattr(arguments, name) for name in ("method", "seed", "jobs", "out", "driver")}
+    verdicts = validation.validate(references, **options, progress=sys.stderr)
     if rendered := [each.summary for each in verdicts if each.summary]:
         print(printable(table(overview(rendered))))
-    print(counted(verdicts), flush=True)
+    print(validation.counted(verdicts), flush=True)
     for each in verdicts:
         if each.verdict == "error":
             fail(str(each), 2)
-    status = exit_status(verdicts, strict=arguments.strict)
+    status = validation.exit_status(verdicts, strict=arguments.strict)
     for option, path, write in reports:
         try:
             if path:
@@ -203,7 +186,6 @@ def _suite(arguments: argparse.Namespace) -> int:
     """
     from hapticrender.accuracy import plate
     from hapticrender.accuracy.suite import CASES, as_rows, run_suite, write_json
-    from hapticrender.report.outputs import check_file
 
     chosen = arguments.method or defaults.METHOD
     if arguments.junit or arguments.out or arguments.jobs > 1:
@@ -237,7 +219,6 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.plants.identify_friction import identify_resonance, identify_screen
     from hapticrender.plants.plate import Plate
     from hapticrender.plants.ultrasonic import UltrasonicPlate
-    from hapticrender.report.outputs import check_file
     from hapticrender.touch.finger import Finger
 
     if arguments.out:
@@ -281,8 +262,6 @@ def identify(arguments: argparse.Namespace) -> int:
 
 def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
     """Profile of an identified device; limits, and what else the scene states of the device, are kept."""
-    from datetime import date
-
     own, device = scene.device_profile, found.profile()
     uncertainty = {name: value for name, value in found.uncertainty().items() if name in device}
     return replace(
@@ -300,7 +279,6 @@ def finger(arguments: argparse.Namespace) -> int:
     """Analyse the finger in a recording; write tables and pictures, print a summary."""
     from hapticrender.analysis import output, pictures
     from hapticrender.analysis.analyse import analyse_finger
-    from hapticrender.report.outputs import check_folder
 
     check_folder("--out", arguments.out)
     for name in output.FILES:
@@ -318,7 +296,6 @@ def finger(arguments: argparse.Namespace) -> int:
 def latency(arguments: argparse.Namespace) -> int:
     """Measure the delay of a loop through a cable, or say where it is stated."""
     from hapticrender.latency import measure_latency, write_delay
-    from hapticrender.report.outputs import check_file
 
     if arguments.out:
         check_file("--out", arguments.out)
@@ -341,14 +318,11 @@ def latency(arguments: argparse.Namespace) -> int:
 def export(arguments: argparse.Namespace) -> int:
     """Write a scene's controller as C sources."""
     from hapticrender.export import export
-    from hapticrender.loop import prepare
-    from hapticrender.report.outputs import check_folder
 
     check_folder("--out", arguments.out)
     scene = _scene(arguments.scene)
     with naming(arguments.scene):
-        rendering = prepare(scene)
-        written = export(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
+        written = export(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
     command = f"make -C {shlex.quote(str(arguments.out))}"
     print(f"wrote {len(written)} files into {arguments.out}; build them with: {command}")
     return 0
@@ -376,8 +350,6 @@ def _print_figures(summary: Any) -> None:
 
 def _recording(path: Path) -> Recording:
     """Load a recording, also from the folder of a rendered scene."""
-    from hapticrender.recordings.recording import Recording
-
     inside = sorted(str(each.parent) for each in path.glob("*/recording.au"))
     path = path / "recording.au" if path.is_dir() else path
     where = f"; there is one in {', '.join(inside)}" if inside else ""
@@ -389,16 +361,12 @@ def _recording(path: Path) -> Recording:
 
 def _scene(reference: str) -> Scene:
     """Read a scene: a built-in one by its name, any other from its file."""
-    from hapticrender.validate import open_scene
-
     with naming(reference):
-        return open_scene(reference)
+        return validation.open_scene(reference)
 
 
 def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
     """Design everything that will run, which refuses what a device cannot do; state before it runs what is missing."""
-    from hapticrender.loop import prepare
-
     renderings = []
     for reference, scene in scenes.items():
         with naming(reference):
