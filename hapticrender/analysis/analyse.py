@@ -9,11 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hapticrender.analysis.course import Course, Signals
+from hapticrender.analysis.course import Course, Rest, Signals, impedance_of, regress, rest_of, track_of
 from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
-from hapticrender.analysis.impedance import impedance_of
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
-from hapticrender.analysis.plate_track import Rest, regress, rest_of, track_of
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Impedance, Segment, Touch, joined
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
 from hapticrender.analysis.tracker import FingerTracker

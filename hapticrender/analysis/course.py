@@ -16,10 +16,12 @@ The rows differ from those that Grigorii et al. 2021 print, (m/2) x'' -+ (I/2) t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hapticrender.analysis.lock_in import Lines
+from hapticrender.analysis.records import Impedance, PlateTrack
 from hapticrender.plants.fitting import MECHANICAL
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array
@@ -27,6 +29,9 @@ from hapticrender.protocols import Array
 TRACKED = MECHANICAL[2:]  # stiffness and damping, first order in time
 UNCERTAINTY = (0.02, 0.02, 0.02, 0.02, 0.1, 0.1)  # relative, of `MECHANICAL`, where a profile has none
 DRIFT, DRIFT_TIME = (0.02, 0.02, 0.2, 0.2), 40.0  # relative, of `TRACKED`, and s: change over a recording, or over this
+CHANCE = 1e-6  # of a plate that is as its model, to leave a `Course.misfit` above 1
+INFORMED = 0.5  # of its uncertainty in the profile: below it the total stiffness counts as measured
+CLEAR = 5.0  # standard errors of the velocity at the finger: below it no impedance is formed
 
 
 @dataclass(frozen=True)
@@ -112,3 +117,120 @@ class Course:
         columns = Signals(unit, s * unit, s**2 * unit, np.zeros_like(unit))
         theta = np.asarray(self.at(time))[..., None, :]
         return -np.swapaxes(columns.residual(theta, self.plate.half_spacing), -1, -2)
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Heave and rocking force (N) and displacement (m) of the plate at rest (n, 4) at `time` (s), joined by lines.
+
+    `samples` is the number of samples of white noise whose mean is as certain as each of them.
+    """
+
+    time: Array
+    values: Array
+    samples: float
+
+    def at(self, time: Array) -> Array:
+        """Values (n, 4) at times (s); before the first and after the last they are held."""
+        return np.stack([np.interp(time, self.time, column) for column in self.values.T], axis=1)
+
+
+def rest_of(course: Course, lines: Lines) -> Rest:
+    """Values at rest from windows without a finger."""
+    slow = Signals.of(lines.mean)
+    force = slow.residual(course.at(lines.time), course.plate.half_spacing)
+    return Rest(lines.time, np.hstack([force, slow.displacement]), float(1.0 / lines.mean_variance.mean()))
+
+
+def regress(course: Course, lines: Lines, noise: Array) -> Course:
+    """Estimate start and slope of a profile's parameters from windows without a finger (`lines`, as for `Signals.of`).
+
+    Minimises the output error ``x - D^-1 f`` of heave and rocking over the noise of the amplitudes, by the white
+    `noise` (m rms) of both, together with the distance from the profile over its uncertainty.  Misfit beyond the noise
+    widens the covariance.
+
+    Notes
+    -----
+    The equation error, linear in the parameters, would be biased by the noise in its regressors: the plate hardly
+    rocks, so that rocking is mostly noise.  Pintelon & Schoukens, System Identification, 2nd ed. 2012, section 9.10.
+    """
+    from scipy.optimize import least_squares
+    from scipy.special import chdtri
+
+    measured = Signals.of(lines.amplitude)
+    prior = np.r_[course.start, course.slope]
+    spread = np.sqrt(np.diagonal(course.covariance))
+    scale = np.where(spread > 0.0, spread, 1e-9 * np.maximum(np.abs(prior), 1e-9))
+    times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
+
+    def left(unknown: Array) -> Array:
+        values = prior + scale * unknown
+        stiffness = replace(course, start=values[:6], slope=values[6:]).dynamic_stiffness(lines.frequency, times)
+        motion = np.linalg.solve(stiffness, measured.force[..., None])[..., 0]
+        error = (measured.displacement - motion) / (noise * np.sqrt(lines.variance)[..., None])
+        return np.r_[error.real.ravel(), error.imag.ravel(), unknown]
+
+    search = least_squares(left, np.zeros(10), method="lm")
+    square, count = float((search.fun[:-10] ** 2).sum()), len(search.fun) - 10
+    data = search.jac[:-10].T @ search.jac[:-10] / max(1.0, square / count)
+    covariance = np.linalg.inv(data + np.eye(10)) * np.outer(scale, scale)
+    values = prior + scale * search.x
+    total = np.r_[0.0, 0.0, 1.0, 1.0, np.zeros(6)]
+    share = np.sqrt((total @ covariance @ total) / (total @ course.covariance @ total))
+    return Course(
+        course.plate, values[:6], values[6:], covariance, bool(share < INFORMED), square / float(chdtri(count, CHANCE))
+    )
+
+
+def track_of(course: Course, duration: float) -> PlateTrack:
+    """Stiffness and damping over a recording (s), at its ends and each second between them."""
+    time = np.unique(np.r_[np.arange(0.0, duration, 1.0), duration])
+    values = course.at(time)[:, 2:].T
+    errors = np.array([np.sqrt(np.diagonal(course.covariance_at(each)))[2:] for each in time]).T
+    tracks, spreads = (dict(zip(TRACKED, each, strict=True)) for each in (values, errors))
+    return PlateTrack(time, tracks, spreads, course.measured)
+
+
+def impedance_of(
+    course: Course, lines: Lines, noise: Array, load: Array, position: Array, position_error: Array, gain_error: float
+) -> Impedance:
+    """Impedance in windows under a mean `load` (N) at a mean `position` (m, both (n,)) with its standard error.
+
+    `lines` are of nine signals: those of `Signals.of`, then (p/a) times the velocity of rocking; `noise` is the white
+    noise of heave and rocking (m rms), `gain_error` the relative standard error of a gain common to both sensors.
+
+    Notes
+    -----
+    In each window and band the heave row of the balance of forces gives F_f, and ``v = j w (x_c + (p/a) a theta)`` the
+    velocity at the finger.  White noise n of the coordinates and the parameters' error e change the quotient by::
+
+        dZ = -([D_cc, D_cr] + j w Z [1, g]) n/v - Phi_c e/v,   g = p/a
+
+    so that it is the noise of the plate under the finger, over the velocity.  An error of g by dg adds
+    ``Z v_r dg/v``, a gain error common to both sensors its share of Z.
+    """
+    amplitudes, a = Signals.of(lines.amplitude), course.plate.half_spacing
+    times = np.broadcast_to(lines.time[:, None], lines.frequency.shape)
+    phi = amplitudes.regressors(a)[..., 0, :]
+    force = amplitudes.force[..., 0] - np.einsum("nbi,ni->nb", phi, course.at(lines.time))
+    velocity = amplitudes.velocity[..., 0] + lines.amplitude[..., 8]
+    s = 2j * np.pi * lines.frequency
+    heave = course.dynamic_stiffness(lines.frequency, times)[..., 0, :]
+    bending, shape = course.bending(lines.frequency), course.plate.displacement(position)[:, 2:]
+    passed = 1 + heave[..., 0] * shape * bending
+    force = force / passed
+    by_coils = course.plate.bending_coil * amplitudes.force[..., 0]
+    velocity = velocity + s * shape * bending * (by_coils + (1 - shape) * force)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = force / velocity
+    at_finger = np.stack(np.broadcast_arrays(1.0, (position / a)[:, None] + 0.0 * value.real), axis=-1)
+    by_noise = (np.abs(heave + (s * value)[..., None] * at_finger) ** 2 @ noise**2) * lines.variance
+    covariance = np.array([course.covariance_at(each) for each in lines.time]).reshape(-1, 6, 6)
+    by_plate = np.einsum("nbi,nij,nbj->nb", phi, covariance, phi.conj()).real / 2
+    by_place = np.abs(value * amplitudes.velocity[..., 1] * (position_error / a)[:, None]) ** 2 / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        by_gain = np.abs(value * gain_error) ** 2 / 2
+        variance = (by_noise + by_plate + by_place) / np.abs(passed * velocity) ** 2 + by_gain
+        clear = np.abs(velocity) > CLEAR * np.abs(s) * noise[0] * np.sqrt(lines.variance)
+    value, error = (np.where(clear, each, np.nan) for each in (value, np.sqrt(variance)))
+    return Impedance(lines.time, lines.frequency, value, error, load, position, velocity)

@@ -1,9 +1,10 @@
-"""What the analysis of a recording finds, each number with its standard error."""
+"""What the analysis of recordings finds, each number with its standard error."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
@@ -74,17 +75,14 @@ class Touch:
     contact: Array  # int (n,): UNLOADED, DOUBTFUL or LOADED
 
 
-def joined(parts: Sequence[Touch]) -> Touch:
-    """Join consecutive spans."""
-    time, contact = (np.concatenate([getattr(part, name) for part in parts]) for name in ("time", "contact"))
-    names = ("normal_load", "position", "velocity")
-    load, position, velocity = (_joined([getattr(part, name) for part in parts]) for name in names)
-    return Touch(time, load, position, velocity, contact)
-
-
-def _joined(parts: Sequence[Series]) -> Series:
-    value, error = (np.concatenate([getattr(part, name) for part in parts]) for name in ("value", "standard_error"))
-    return Series(value, error, parts[0].bandwidth)
+def joined(parts: Sequence[Any]) -> Any:
+    """Join consecutive spans: of a `Touch`, and so of each `Series` and array in it."""
+    first = parts[0]
+    if isinstance(first, np.ndarray):
+        return np.concatenate(parts)
+    if isinstance(first, float):
+        return first
+    return type(first)(*(joined([getattr(part, each.name) for part in parts]) for each in fields(first)))
 
 
 @dataclass(frozen=True, eq=False)
