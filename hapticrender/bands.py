@@ -20,22 +20,12 @@ def hold_last(position: Array) -> Array:
     return np.where(index >= 0, position[np.maximum(index, 0)], 0.0)
 
 
-_COLUMNS: dict[str, tuple[str, type, float | None]] = {  # unit, type, least value
-    "frequency": ("Hz", float, 0.0),
-    "wavenumber": ("1/m", float, 0.0),
-    "phase": ("rad", float, None),
-    "envelope": ("m", complex, None),
+_COLUMNS: dict[str, tuple[str, type]] = {  # unit, type
+    "frequency": ("Hz", float),
+    "wavenumber": ("1/m", float),
+    "phase": ("rad", float),
+    "envelope": ("m", complex),
 }
-
-
-def _check(name: str, column: Array, shape: tuple[int, ...], unit: str, least: float | None) -> None:
-    if column.ndim != 1 or column.shape != shape:
-        raise ValueError(f"{name} has shape {column.shape}: must be one number a band, as many as frequency has")
-    good = np.isfinite(column) if least is None else np.isfinite(column) & (column >= least)
-    if not good.all():
-        first = int(np.argmin(good))
-        bound = "finite" if least is None else f"finite and >= {least:g}"
-        raise ValueError(f"{name}[{first}] = {column[first]}: must be {bound} ({unit})")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,11 +75,19 @@ class Bands:
     unfelt: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name, (unit, kind, least) in _COLUMNS.items():
-            if getattr(self, name) is not None:
-                column: Array = np.asarray(getattr(self, name), kind)
-                object.__setattr__(self, name, column)
-                _check(name, column, self.frequency.shape, unit, least)
+        for name, (unit, kind) in _COLUMNS.items():
+            if getattr(self, name) is None:
+                continue
+            column: Array = np.asarray(getattr(self, name), kind)
+            object.__setattr__(self, name, column)
+            if column.ndim != 1 or column.shape != self.frequency.shape:
+                raise ValueError(
+                    f"{name} has shape {column.shape}: must be one number a band, as many as frequency has"
+                )
+            signed = name in ("phase", "envelope")
+            for bad in np.flatnonzero(~(np.isfinite(column) & (signed | (column.real >= 0.0))))[:1]:
+                bound = "finite" if signed else "finite and >= 0"
+                raise ValueError(f"{name}[{bad}] = {column[bad]}: must be {bound} ({unit})")
 
     def __eq__(self, other: object) -> bool:
         """Whether it is of the same type, with the same numbers."""
@@ -117,25 +115,19 @@ class Bands:
     def checked(self, name: str, waveform: Callable[[Array, Array], Any], time: Array, position: Array) -> Array:
         """Target waveform at `time` (s) and `position` (m); the texture `name` must return finite numbers.
 
-        0 while the finger is away, where it all follows it.
-
-        Raises
-        ------
-        ValueError
-            The first sample that is wrong, with its time and position.
+        0 while the finger is away, where it all follows it.  A ValueError names the first sample that is wrong, with
+        its time and position.
         """
         values = waveform(np.array(time), np.array(position))  # which it may work in
         if np.shape(values) != np.shape(position) or np.asarray(values).dtype.kind not in "iuf":
-            found = (
-                f"{values.dtype} of shape {values.shape}" if isinstance(values, np.ndarray) else type(values).__name__
-            )
+            array = isinstance(values, np.ndarray)
+            found = f"{values.dtype} of shape {values.shape}" if array else type(values).__name__
             raise ValueError(f"{name}.waveform returned {found}: must be {len(position)} numbers, one a sample")
         away = np.isnan(position) & self.follows_finger
         values = np.where(away, 0.0, np.asarray(values, float))
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            at = f"t = {time[bad[0]]:g} s, x = {position[bad[0]]:g} m"
-            raise ValueError(f"{name}.waveform returned {values[bad[0]]} at {at}: must be finite")
+        for bad in np.flatnonzero(~np.isfinite(values))[:1]:
+            at = f"t = {time[bad]:g} s, x = {position[bad]:g} m"
+            raise ValueError(f"{name}.waveform returned {values[bad]} at {at}: must be finite")
         return values
 
     def set_points(self) -> Array:

@@ -117,6 +117,12 @@ def frequencies(value: Any, *, zero: bool) -> np.ndarray[Any, Any]:
     return hertz
 
 
+def table(key: str, value: Any) -> dict[str, Any]:
+    """Return a table as a dict."""
+    require(isinstance(value, Mapping), key, value, "a table of parameters", TypeError)
+    return dict(value)
+
+
 def rising(key: str, value: Any, count: int) -> tuple[float, ...]:
     """Return `count` rising times (s) from 0 to 100 h as a tuple of floats."""
     times = numbers(key, value, "s", least=0, most=360_000)
@@ -201,8 +207,7 @@ def checked(check: Callable[..., Any], default: Any = MISSING, *, about: str = "
 
 def mapping(check: Callable[[str, Any], Any], about: str = "") -> Any:
     """Field of a `Validated` class: a mapping, empty by default, that keeps what ``check(name, value)`` returns."""
-    described = {"about": about} if about else {}
-    return field(default_factory=dict, hash=False, metadata={"check": check, "bounds": {}, **described})
+    return field(default_factory=dict, hash=False, metadata=checked(check, about=about).metadata)
 
 
 def parameter(
@@ -264,6 +269,15 @@ class Validated:
         """Defaults with the parameters in `overrides` replaced; a name that is unknown is a ValueError."""
         check_names(overrides, cls.names())
         return cls(**overrides)
+
+    @classmethod
+    def read(cls, key: str, value: Any) -> Self:
+        """Return `value`, which is one, or the table of one."""
+        if isinstance(value, cls):
+            return value
+        require(isinstance(value, Mapping), key, value, f"a table or {cls.__name__}", TypeError)
+        with inside(key):
+            return cls.with_overrides(value)
 
 
 def check_names(given: Mapping[str, Any], known: Iterable[str], in_file: Iterable[str] = ()) -> None:

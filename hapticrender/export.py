@@ -53,20 +53,15 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
 
     `rendering` is a scene, prepared for the device that the board drives (`hapticrender.prepare`).  The board can be
     set to `bands` at most, at most 64, by default 8, or the scene's number if that is larger.  `force` overwrites
-    sources that were changed since they were written.
-
-    Raises
-    ------
-    ValueError
-        The board cannot play the scene, or a file of `folder` would be overwritten that is not as it was written.
+    sources that were changed since they were written.  A ValueError where the board cannot play the scene, or a file of
+    `folder` would be overwritten that is not as it was written.
     """
     sizes, design = board_design(rendering, bands)
     texts = {path.name: path.read_text(encoding="utf-8") for path in sources()}
-    if not force:
-        for name, text in texts.items():
-            _refuse_changed(folder / name, text)
-        for name in ("design.h", "design.c"):
-            _refuse_changed(folder / name, GENERATED)
+    for name, text in {} if force else {**texts, "design.h": GENERATED, "design.c": GENERATED}.items():
+        path = folder / name
+        if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(text):
+            raise ValueError(f"{str(path)!r}: is not as it was written: choose another folder, or add --force")
     defines = "".join(f"#define LAW_{name} {value}\n" for name, value in sizes.items())
     texts["design.h"] = f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{defines}\n{_memory(sizes)}\n#endif\n"
     tables = _table("design_t design", design), _table("supervision_t supervision", supervision_table(rendering))
@@ -87,7 +82,7 @@ def _memory(sizes: dict[str, int]) -> str:
 
 def sources() -> list[Path]:
     """Paths of the portable sources as installed."""
-    folder = Path(str(files("hapticrender.drivers").joinpath("firmware")))
+    folder = Path(str(files("hapticrender.drivers"))) / "firmware"
     return sorted(path for path in folder.iterdir() if path.name.endswith(SUFFIXES))
 
 
@@ -169,12 +164,6 @@ def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
     return most
 
 
-def _refuse_changed(path: Path, text: str) -> None:
-    """Refuse to overwrite a file that does not begin with `text`."""
-    if path.exists() and not path.read_text(encoding="utf-8", errors="replace").startswith(text):
-        raise ValueError(f"{str(path)!r}: is not as it was written: choose another folder, or add --force")
-
-
 def _table(declared: str, fields: dict[str, Any]) -> str:
     lines = [f"    .{name} = {_literal(value)},\n" for name, value in fields.items()]
     return f"const {declared} = {{\n{''.join(lines)}}};\n"
@@ -183,13 +172,10 @@ def _table(declared: str, fields: dict[str, Any]) -> str:
 def _literal(value: Any) -> str:
     """C initialiser of an integer, a number, an array of numbers, or a record; numbers in full precision."""
     if isinstance(value, dict):
-        return _braced([f".{name} = {_literal(each)}" for name, each in value.items()])
-    if np.ndim(value):
-        return _braced([_literal(each) for each in value])
-    return f"{int(value)}u" if isinstance(value, int) else f"REAL({float(value)!r})"
-
-
-def _braced(items: list[str]) -> str:
-    """Initialiser of an array, in lines of at most 120 characters."""
+        items = [f".{name} = {_literal(each)}" for name, each in value.items()]
+    elif np.ndim(value):
+        items = [_literal(each) for each in value]
+    else:
+        return f"{int(value)}u" if isinstance(value, int) else f"REAL({float(value)!r})"
     joined = ", ".join(items)
     return f"{{{joined}}}" if len(joined) < 80 else "{\n    " + ",\n    ".join(items) + ",\n    }"

@@ -13,8 +13,6 @@ _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
 def quantity(value: float | None, unit: str) -> str:
     """Format a measured `value` (SI) with a prefix and three digits, a dash for none.
 
-    Examples
-    --------
     >>> quantity(1.0016e-5, "m"), quantity(None, "s"), quantity(2e-7, "m")
     ('10.0 µm', '–', '200 nm')
     """
@@ -29,8 +27,6 @@ def quantity(value: float | None, unit: str) -> str:
 def short(value: float, unit: str, digits: int = 4) -> str:
     """Format a chosen `value` (SI) with a prefix and no more digits than it needs.
 
-    Examples
-    --------
     >>> short(1e-3, "m"), short(62.5, "Hz"), short(468.3e-6, "m", 3)
     ('1 mm', '62.5 Hz', '468 µm')
     """
@@ -52,8 +48,6 @@ def degrees(angle: float | None) -> str:
 def band_label(band: Mapping[str, Any]) -> str:
     """Name a band: its frequency, or its wavelength and the median frequency at which it was judged.
 
-    Examples
-    --------
     >>> band_label({"frequency": 62.5, "wavelength": None}), band_label({"frequency": 171.2, "wavelength": 468.3e-6})
     ('62.5 Hz', '468 µm (171 Hz)')
     """
@@ -98,8 +92,6 @@ def _finite(value: Any) -> Any:
 def printable(text: str) -> str:
     r"""Replace every character but line feeds that a terminal would not print by its escape.
 
-    Examples
-    --------
     >>> printable("a\x1b[2J")
     'a\\x1b[2J'
     """

@@ -219,10 +219,7 @@ class Renderer(Protocol):
     def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
         """Open a scene on the device behind `driver`, or on the simulated one; read its tables once, check everything.
 
-        Raises
-        ------
-        ValueError, TypeError
-            The scene requests what the device cannot do.
+        A ValueError or TypeError where the scene requests what the device cannot do.
         """
         ...
 

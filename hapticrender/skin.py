@@ -49,8 +49,6 @@ def velocity_per_unit(recording: Recording, frequency: Any) -> Array:
 def skin_bands(recording: Recording) -> list[SkinBand]:
     """Predicted skin velocity of every judged band, at the device's first place.
 
-    Examples
-    --------
     >>> import hapticrender as hr
     >>> scene = hr.Scene(texture=hr.Grating(velocity=5e-3, frequency=100.0), duration=1.5)
     >>> [band] = skin_bands(hr.render(scene))

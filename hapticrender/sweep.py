@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
+from functools import partial
+from itertools import chain
 from typing import Any
 
 from hapticrender import checks
@@ -49,7 +51,7 @@ def sweep(
     Raises
     ------
     SweepError
-        A scene failed: its number, its name and the cause.  Tasks that have not begun are cancelled.
+        A scene failed; tasks that have not begun are cancelled.
 
     Examples
     --------
@@ -62,15 +64,8 @@ def sweep(
     checks.require(isinstance(scenes, Iterable), "scenes", scenes, "scenes, in a list for example", TypeError)
     numbered = list(enumerate(scenes))
     parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
-    if executor is None:
-        return _run(numbered, judge, method)
-    tasks = [executor.submit(_run, part, judge, method) for part in parts]
-    try:
-        return [each for task in tasks for each in task.result()]
-    except BaseException:
-        for task in tasks:
-            task.cancel()
-        raise
+    found = (map if executor is None else executor.map)(partial(_run, judge=judge, method=method), parts)
+    return list(chain.from_iterable(found))  # where one raises, `Executor.map` cancels the others
 
 
 def worst_error(recording: Recording) -> float:

@@ -119,8 +119,6 @@ def validate(
     side by side, on simulated devices; where one is killed, what is not finished is an error.
     Files of each scene that does not pass go into a folder of its name in `out`.
 
-    Examples
-    --------
     >>> [verdict] = validate(["one-texture-electroadhesion"], seed=1)
     >>> verdict.passed
     True

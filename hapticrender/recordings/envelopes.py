@@ -182,8 +182,6 @@ def amplitude_error(achieved: ArrayLike, target: ArrayLike, axis: int | None = N
     ``|X|/|target| - 1`` of every element; with an `axis` the rms of |X| - |target| along it over the rms of |target|.
     Envelopes (complex) or amplitudes in one unit, of shapes that broadcast; NaN where the target is zero.
 
-    Examples
-    --------
     >>> float(amplitude_error(1.1j, 1.0)), float(amplitude_error([0.9, 1.1], [1.0, 1.0], axis=0))  # doctest: +ELLIPSIS
     (0.1..., 0.1...)
     """

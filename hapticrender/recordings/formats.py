@@ -69,8 +69,6 @@ def write_sound(path: Path, signal: Array, rate: float, unit: str) -> float:
 def round_up(peak: float) -> float:
     """Round up to 1, 2 or 5 times a power of ten; 1 for silence.
 
-    Examples
-    --------
     >>> round_up(1.3), round_up(0.5), round_up(0.0)
     (2.0, 0.5, 1.0)
     """

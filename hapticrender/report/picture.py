@@ -74,8 +74,6 @@ def draw(recording: Recording) -> Any:
 def drawn(unit: str) -> tuple[float, str]:
     """Scale and unit in which a quantity of `unit` (SI) is drawn.
 
-    Examples
-    --------
     >>> drawn("m")
     (1000000.0, 'µm')
     """

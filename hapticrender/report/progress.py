@@ -11,8 +11,6 @@ from typing import TextIO
 def progress(label: str, stream: TextIO) -> Iterator[Callable[[float, float], None]]:
     """Yield ``tick(done, total)`` (s), which shows the share that is done on a terminal; write `label` at the end.
 
-    Examples
-    --------
     >>> import sys
     >>> with progress("1/2 first", sys.stdout) as tick:
     ...     tick(0.5, 1.0)

@@ -23,8 +23,6 @@ def waveform_error(summary: Mapping[str, Any]) -> float | None:
 def at(places: Sequence[str]) -> str:
     """Name where errors are taken, or of which quantity.
 
-    Examples
-    --------
     >>> at(["centre", "end_1", "end_2"]), at(["end_1"]), at(["skin"])
     ('at centre and ends', 'at end 1', 'of skin velocity')
     """

@@ -104,10 +104,9 @@ def strongest_carriers(
     spacing = checks.number("spacing", spacing, "Hz", above=0)
     low, high = checks.numbers("passband", passband, "Hz", least=0, most=1e6, count=2)
     frequency, power = _spectrum(values, rate, spacing / 16)
-    peak = np.zeros(power.size, bool)
-    peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])
     inside = (frequency >= low) & (frequency <= high)
-    candidates = np.flatnonzero(peak & inside)
+    peak = np.diff(power, prepend=np.inf, append=np.inf)  # neither end is one
+    candidates = np.flatnonzero((peak[:-1] >= 0) & (peak[1:] < 0) & inside)
     if not candidates.size:
         candidates = np.flatnonzero(inside)
     candidates = candidates[np.argsort(-power[candidates], kind="stable")]
@@ -121,17 +120,13 @@ def strongest_carriers(
 
 def _spectrum(values: Array, rate: float, resolution: float) -> tuple[Array, Array]:
     """Power averaged over half-overlapping Hann windows of 1/resolution seconds (Welch's method)."""
-    window_size = max(round(rate / resolution), 2)
-    if window_size > MOST_WINDOW:
-        raise ValueError(
-            f"spacing = {16 * resolution:g} Hz: must be >= {16 * rate / MOST_WINDOW:.3g} Hz at {rate:g} samples/s"
-        )
-    size = min(window_size, values.size)
-    window = np.hanning(size)
-    power = np.zeros(window_size // 2 + 1)
-    for start in range(0, values.size - size + 1, max(size // 2, 1)):
-        power += np.abs(np.fft.rfft(values[start : start + size] * window, window_size)) ** 2
-    return np.arange(power.size) * (rate / window_size), power
+    from scipy.signal import welch
+
+    size = max(round(rate / resolution), 2)
+    least = f">= {16 * rate / MOST_WINDOW:.3g} Hz at {rate:g} samples/s"
+    checks.require(size <= MOST_WINDOW, "spacing", 16 * resolution, least)
+    window = np.hanning(min(size, values.size) + 2)[1:-1]
+    return welch(values, rate, window, nfft=size, detrend=False)  # type: ignore[no-any-return]
 
 
 def _passband(frequency: Array, low: float, high: float) -> Array:

@@ -60,22 +60,8 @@ def _day(key: str, value: Any) -> date:
 
 
 def _uncertainty(key: str, value: Any) -> dict[str, float]:
-    checks.require(isinstance(value, Mapping), key, value, "a table of numbers", TypeError)
-    return {name: checks.number(f"{key}.{checks.plain(name)}", each, least=0.0) for name, each in value.items()}
-
-
-def _parameters(key: str, value: Any) -> dict[str, Any]:
-    checks.require(isinstance(value, Mapping), key, value, "a table of parameters", TypeError)
-    return dict(value)
-
-
-def _part(key: str, value: Any, kind: type[Any]) -> Any:
-    """Return `value`, a `kind`, also from its table."""
-    if isinstance(value, kind):
-        return value
-    checks.require(isinstance(value, Mapping), key, value, f"a table or {kind.__name__}", TypeError)
-    with checks.inside(key):
-        return kind.with_overrides(value)
+    table = checks.table(key, value)
+    return {name: checks.number(f"{key}.{checks.plain(name)}", each, least=0.0) for name, each in table.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,10 +93,10 @@ class DeviceProfile(Validated):
     measured_with: str = checked(checks.text, "", about="with what")
     measured_on: date | None = checked(_day, None, about='when, also as a text "2026-11-22"')
     probe: bool = checked(checks.flag, True, about="whether the device is probed before the loop closes")
-    device: Mapping[str, Any] = mapping(_parameters, "parameters (number, str or bool), as in a scene's ``[device]``")
+    device: Mapping[str, Any] = mapping(checks.table, "parameters (number, str or bool), as in a scene's ``[device]``")
     uncertainty: Mapping[str, float] = mapping(_uncertainty, "standard uncertainty of parameters, in their units")
-    calibration: Calibration = checked(_part, Calibration(), about="also as a table", kind=Calibration)
-    limits: Limits = checked(_part, Limits(), about="also as a table", kind=Limits)
+    calibration: Calibration = checked(Calibration.read, Calibration(), about="also as a table")
+    limits: Limits = checked(Limits.read, Limits(), about="also as a table")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -121,10 +107,7 @@ class DeviceProfile(Validated):
     def load(cls, path: str | os.PathLike[str]) -> Self:
         """Read a profile; its file's stem is the name of one that has none.
 
-        Raises
-        ------
-        SceneError
-            In one line: file, key, value, bound and unit.
+        A `SceneError` states in one line file, key, value, bound and unit.
         """
         with naming(path):
             found = cls.from_table(toml.loads(toml.read_text(path)))
@@ -159,4 +142,4 @@ class DeviceProfile(Validated):
     def __str__(self) -> str:
         """Which device it is, and who measured it when."""
         origin = ", ".join(str(each) for each in (self.measured_by, self.measured_on) if each)
-        return f"{self.name or self.kind} ({origin})" if origin else self.name or self.kind
+        return (self.name or self.kind) + (f" ({origin})" if origin else "")

@@ -113,11 +113,8 @@ NAMED = {"none": NONE, "light": LIGHT, "heavy": HEAVY, "light-2nd-order": LIGHT_
 
 def read_mechanics(value: Any, normal_load: Callable[[], float]) -> FingerMechanics:
     """Mechanics from a name, a table of numbers, or mechanics; "auto" chooses by `normal_load` (N)."""
-    if isinstance(value, FingerMechanics):
-        return value
-    if isinstance(value, Mapping):
-        with checks.inside("mechanics"):
-            return FingerMechanics.with_overrides(value)
+    if isinstance(value, FingerMechanics | Mapping):
+        return FingerMechanics.read("mechanics", value)
     checks.choice("mechanics", value, ("auto", *NAMED))
     if value == "auto":
         return LIGHT if normal_load() < LIGHT_BELOW else HEAVY

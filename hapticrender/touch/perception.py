@@ -107,8 +107,6 @@ def drop_unfelt(bands: Bands, *, top_speed: float, lowest: float, highest: float
     that went, each over its threshold, sum to less than 1: together and in phase they are below it too.  Masking of one
     band by another is not used.  No band left is a ValueError.
 
-    Examples
-    --------
     >>> bands = Bands(frequency=[20.0, 60.0], wavenumber=[0.0, 0.0], phase=[0.0, 0.0], envelope=[1e-5, 1e-7])
     >>> drop_unfelt(bands, top_speed=0.0, lowest=5.0, highest=1000.0).unfelt
     ('60 Hz: target 100 nm is below the detection threshold, 583 nm at 60 Hz',)

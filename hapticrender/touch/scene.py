@@ -74,19 +74,17 @@ Value = float | int | str | bool
 
 def _read_table(name: str, values: Any) -> dict[str, Value]:
     """Return a table of numbers, texts and booleans in Python's own types, so that TOML can hold them."""
-    checks.require(isinstance(values, Mapping), name, values, "a table of parameters", TypeError)
     found: dict[str, Value] = {}
-    for key, value in values.items():
+    for key, value in checks.table(name, values).items():
         checks.require(isinstance(key, str), name, key, "a table with texts as keys", TypeError)
         if (TABLES[name], key) in OWN:
             raise ValueError(f"{name}.{key}: is not part of this table: give it to Scene as {OWN[TABLES[name], key]}")
         if isinstance(value, bool | np.bool_):
-            found[key] = bool(value)
-        elif isinstance(value, str):
-            found[key] = value
-        else:
+            value = bool(value)
+        elif not isinstance(value, str):
             checks.number(f"{name}.{checks.plain(key)}", value)
-            found[key] = int(value) if isinstance(value, Integral) else float(value)
+            value = int(value) if isinstance(value, Integral) else float(value)
+        found[key] = value
     return found
 
 
@@ -198,17 +196,13 @@ class Scene(Validated):
     @property
     def panel(self) -> TouchPanel | None:
         """Touch panel of the simulated device; None: the position is known without error."""
-        with checks.inside("touch_panel"):
-            return TouchPanel.with_overrides(self.touch_panel) if self.touch_panel else None
+        return TouchPanel.read("touch_panel", self.touch_panel) if self.touch_panel else None
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
         """Read a scene file; files that it names are taken from its own folder, and read as well.
 
-        Raises
-        ------
-        SceneError
-            In one line: file, key, value, bound and unit.
+        A `SceneError` states in one line file, key, value, bound and unit.
         """
         with naming(path):
             text = toml.read_text(path)
@@ -249,8 +243,6 @@ def scene_keys(table: str) -> set[str]:
 def distinct_names(names: Iterable[str]) -> list[str]:
     """Number the names of scenes that occur more than once: "a", "b (1)", "b (2)".
 
-    Examples
-    --------
     >>> distinct_names(["b", "a", "b", "b (1)"])
     ['b (2)', 'a', 'b (3)', 'b (1)']
     """
@@ -266,7 +258,12 @@ def distinct_names(names: Iterable[str]) -> list[str]:
 def _read_scene(table: dict[str, Any], folder: Path, name: str) -> Scene:
     table = _with_profile(table, folder)
     _check_keys(table)
-    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name", _usable(name))}
+    values: dict[str, Any] = {"duration": table.get("duration"), "name": table.get("name")}
+    if values["name"] is None:
+        try:
+            values["name"] = checks.name("name", name)
+        except ValueError:  # no name of a file can be that of every scene
+            values["name"] = Scene.name
     for own, where in TABLES.items():
         rest = dict(table.get(where, {}))
         values |= {OWN[where, key]: rest.pop(key) for key in list(rest) if (where, key) in OWN}
@@ -305,14 +302,6 @@ def _check_keys(table: dict[str, Any]) -> None:
     checks.check_names(table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
-def _usable(name: str) -> str:
-    """Return the name of a file if it can be that of a scene, else "scene"."""
-    try:
-        return checks.name("name", name)
-    except ValueError:
-        return "scene"
-
-
 def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], folder: Path, extra: Any = ()) -> Any:
     """Make the object that `table[choice]` names from the keys that are its fields; `extra` keys are left alone."""
     bound = f"a table with {choice} = one of {', '.join(kinds)}"
@@ -322,21 +311,18 @@ def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], f
         entries = fields(kind)
         checks.check_names(table, [choice, *(entry.name for entry in entries), *extra])
         required = [entry.name for entry in entries if entry.default is entry.default_factory is MISSING]
-        values: dict[str, Any] = dict.fromkeys(required) | {
-            entry.name: table[entry.name] for entry in entries if entry.name in table
-        }
-        if isinstance(values.get("parts"), list):
-            values["parts"] = [_read_part(f"parts[{i}]", part, folder) for i, part in enumerate(values["parts"])]
+        given = {entry.name: table[entry.name] for entry in entries if entry.name in table}
+        values: dict[str, Any] = dict.fromkeys(required) | given
+        if isinstance(values.get("parts"), list):  # pairs of a texture and a number; others are the texture's to refuse
+            values["parts"] = [
+                (_read_kind(part[0], f"parts[{i}][0]", "kind", TEXTURES, folder), part[1])
+                if isinstance(part, list) and len(part) == 2
+                else part
+                for i, part in enumerate(values["parts"])
+            ]
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""
         return kind(**values)
-
-
-def _read_part(key: str, part: Any, folder: Path) -> Any:
-    """Pair of a texture, from its table, and a number; anything else is left for the texture to refuse."""
-    if not (isinstance(part, list) and len(part) == 2):
-        return part
-    return _read_kind(part[0], f"{key}[0]", "kind", TEXTURES, folder), part[1]
 
 
 def _refuse_fingers(finger: Any) -> None:
