@@ -14,12 +14,17 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
-from hapticrender.recordings.formats import _h5py, naming_damage
+from hapticrender.recordings.formats import h5_arrays, mat_arrays, naming_damage, npz_arrays
 from hapticrender.recordings.journal import Header, join
 from hapticrender.touch.tribometer import unwrap_counts
 
 METHOD = "recorded elsewhere"
 EVEN = 0.5  # samples: farthest that a time may be from its place on an even grid
+CONTAINERS: dict[str, tuple[Callable[[Path], Any], str]] = {  # what reads their arrays, and what they are
+    ".mat": (mat_arrays, "a MAT file"),
+    **dict.fromkeys((".h5", ".hdf5"), (h5_arrays, "an HDF5 file")),
+    ".npz": (npz_arrays, "an NPZ file of arrays"),
+}
 Scale = float | tuple[float, float]
 Chosen = str | Sequence[str] | Mapping[str, Scale]
 
@@ -31,23 +36,15 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
     columns are "1", "2" and so on.  An empty field is NaN.  Columns of a table, shape (n, k), are named "table[0]" and
     so on; its longer side is time.
 
-    Raises
-    ------
-    OSError
-        The file is not there or may not be read.
-    ValueError
-        The format is not known, the file is damaged, or a field of a CSV file is no number.
-    MissingExtra
-        An HDF5 file, or a MAT file of version 7.3, without h5py.
+    An OSError where the file is not there or may not be read; a ValueError where the format is not known, the file is
+    damaged, or a field of a CSV file is no number; a `MissingExtra` for an HDF5 file, or a MAT file of version 7.3,
+    without h5py.
     """
     path = Path(path)
-    readers: dict[str, Callable[[Path], Mapping[str, Any]]] = {
-        ".csv": _read_text, ".txt": _read_text, ".mat": _read_mat, ".h5": _read_hdf5, ".hdf5": _read_hdf5,
-        ".npz": _read_npz,
-    }  # fmt: skip
-    require(path.suffix.lower() in readers, "path", str(path), f"a file that ends in {', '.join(readers)}")
+    ending, text = path.suffix.lower(), (".csv", ".txt")
+    require(ending in (*text, *CONTAINERS), "path", str(path), f"a file that ends in {', '.join((*text, *CONTAINERS))}")
     with path.open("rb"):  # a missing file is the same OSError for every format
-        found = readers[path.suffix.lower()](path)
+        found: Mapping[str, Any] = _read_text(path) if ending in text else _read_arrays(path, *CONTAINERS[ending])
     columns: dict[str, Array] = {}
     others = []
     for name, values in found.items():
@@ -199,6 +196,11 @@ def _read_text(path: Path) -> dict[str, Array]:
     return dict(zip(names, np.array(values).reshape(-1, len(names)).T, strict=True))
 
 
+def _read_arrays(path: Path, arrays: Callable[[Path], Any], what: str) -> dict[str, Any]:
+    with naming_damage(path, f"damaged, or not {what}"), arrays(path) as found:
+        return {name: load() for name, (_, load) in found.items()}
+
+
 def _separator(lines: Sequence[str]) -> str | None:
     """What separates the columns, by the first two lines; None: spaces.
 
@@ -239,35 +241,3 @@ def _number(text: str) -> float | None:
         return None if "_" in text else float(text or "nan")
     except ValueError:
         return None
-
-
-def _read_mat(path: Path) -> Mapping[str, Any]:
-    from scipy.io import loadmat
-
-    with naming_damage(path, "damaged, or not a MAT file"):
-        try:
-            found = loadmat(path, appendmat=False)
-        except NotImplementedError:  # version 7.3 is HDF5
-            found = None
-    if found is None:
-        return _read_hdf5(path)
-    return {name: values for name, values in found.items() if not name.startswith("__")}
-
-
-def _read_hdf5(path: Path) -> dict[str, Array]:
-    h5py = _h5py()
-    found: dict[str, Array] = {}
-
-    def take(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset):
-            found[name] = entry[()]
-
-    with naming_damage(path, "damaged, or not an HDF5 file"), h5py.File(path, "r") as file:
-        file.visititems(take)
-    return found
-
-
-def _read_npz(path: Path) -> dict[str, Array]:
-    problem = "damaged, or not an NPZ file of arrays"
-    with naming_damage(path, problem), path.open("rb") as opened, np.load(opened) as file:
-        return {name: file[name] for name in file.files}

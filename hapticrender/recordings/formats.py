@@ -9,6 +9,7 @@ import os
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
 
+Arrays = dict[str, tuple[int, Callable[[], Any]]]  # of a file, by name: bytes, and what reads it
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 
 
@@ -108,12 +110,6 @@ def _values(header: Header, frames: Any) -> dict[str, Any]:
     return {"header": header.to_json(), "rate": header.rate, "time": np.arange(len(frames)) / header.rate, **signals}
 
 
-def _assembled(path: Path, load: Callable[[str], Any]) -> tuple[Header, Array]:
-    """Header and frames from ``load(name)`` for the header and each signal."""
-    header = Header.from_json(str(np.asarray(load("header")).ravel()[0]), str(path))
-    return header, join(header, {name: load(name) for name in header.slices})
-
-
 @contextmanager
 def naming_damage(path: Path, problem: str = "not a recording") -> Iterator[None]:
     """Name the file and the `problem` in whatever a damaged one makes numpy, zipfile, scipy or h5py raise."""
@@ -128,20 +124,12 @@ def naming_damage(path: Path, problem: str = "not a recording") -> Iterator[None
         raise ValueError(f"{path}: {problem} ({reason})") from error
 
 
-def _check_size(path: Path, name: str, size: int) -> None:
-    """Refuse an array of more bytes than its file: `save` never compresses."""
-    if size > path.stat().st_size:
-        raise ValueError(f"{name} has {size} bytes, the file {path.stat().st_size}: compressed recordings are not read")
-
-
-def _read_npz(path: Path) -> tuple[Header, Array]:
+@contextmanager
+def npz_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of an NPZ file."""
     with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what is no archive
-
-        def load(name: str) -> Any:
-            _check_size(path, name, file.zip.getinfo(f"{name}.npy").file_size)
-            return file[name]
-
-        return _assembled(path, load)
+        size = {each.filename: each.file_size for each in file.zip.infolist()}
+        yield {name: (size[f"{name}.npy"], partial(file.__getitem__, name)) for name in file.files}
 
 
 def _h5py() -> Any:
@@ -161,38 +149,63 @@ def _write_h5(path: Path, header: Header, frames: Any) -> None:
                 file[name].attrs["unit"] = units.get(name, header.unit)
 
 
-def _read_h5(path: Path) -> tuple[Header, Array]:
-    h5py = _h5py()
+@contextmanager
+def h5_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of an HDF5 file, but none that lies in another file."""
+    h5py, found = _h5py(), Arrays()
+
+    def take(name: str, entry: Any) -> None:
+        if isinstance(entry, h5py.Dataset) and not (entry.external or entry.is_virtual):
+            found[name] = math.prod(entry.shape) * entry.dtype.itemsize, partial(entry.__getitem__, ())
+
     with h5py.File(path, "r") as file:
+        file.visititems(take)  # which follows no link
+        yield found
 
-        def load(name: str) -> Any:
-            entry = file[name] if isinstance(file.get(name, getlink=True), h5py.HardLink) else None
-            if not isinstance(entry, h5py.Dataset) or entry.external or entry.is_virtual:
-                raise ValueError(f"{name}: is missing, or no data set of this file")
-            _check_size(path, name, math.prod(entry.shape) * entry.dtype.itemsize)
-            return entry.asstr()[()] if name == "header" else entry[()]
 
-        return _assembled(path, load)
+@contextmanager
+def mat_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of a MAT file; those of version 7.3 are HDF5."""
+    from scipy.io import loadmat, whosmat
+
+    try:
+        found = whosmat(path, appendmat=False)
+    except NotImplementedError:
+        with h5_arrays(path) as arrays:
+            yield arrays
+        return
+
+    def load(name: str) -> Any:
+        return loadmat(path, appendmat=False, variable_names=[name])[name]
+
+    yield {name: (math.prod(shape) * (1 if kind == "char" else 8), partial(load, name)) for name, shape, kind in found}
+
+
+def _reader(arrays: Callable[[Path], Any]) -> Callable[[Path], tuple[Header, Array]]:
+    """Reader of recordings that `write` has saved as arrays by name, never compressed."""
+
+    def read(path: Path) -> tuple[Header, Array]:
+        with arrays(path) as found:
+
+            def load(name: str) -> Any:
+                if name not in found:
+                    raise ValueError(f"{name}: is missing, or no data set of this file")
+                (size, values), most = found[name], path.stat().st_size
+                if size > most:
+                    raise ValueError(f"{name} has {size} bytes, the file {most}: compressed recordings are not read")
+                return values()
+
+            text = np.asarray(load("header")).ravel()[0]
+            header = Header.from_json(text.decode() if isinstance(text, bytes) else str(text), str(path))
+            return header, join(header, {name: load(name) for name in header.slices})
+
+    return read
 
 
 def _write_mat(path: Path, header: Header, frames: Any) -> None:
     from scipy.io import savemat
 
     savemat(path, _values(header, frames), oned_as="column")
-
-
-def _read_mat(path: Path) -> tuple[Header, Array]:
-    from scipy.io import loadmat, whosmat
-
-    shapes = {name: shape for name, shape, _ in whosmat(path, appendmat=False)}
-
-    def load(name: str) -> Any:
-        if name not in shapes:
-            raise ValueError(f"{name}: is missing")
-        _check_size(path, name, math.prod(shapes[name]) * (1 if name == "header" else 8))
-        return loadmat(path, appendmat=False, variable_names=[name])[name]
-
-    return _assembled(path, load)
 
 
 def _write_csv(path: Path, header: Header, frames: Any) -> None:
@@ -249,10 +262,10 @@ def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: fl
 SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}
 READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
     ".au": read_journal,
-    ".npz": _read_npz,
-    ".h5": _read_h5,
-    ".hdf5": _read_h5,
-    ".mat": _read_mat,
+    ".npz": _reader(npz_arrays),
+    ".h5": _reader(h5_arrays),
+    ".hdf5": _reader(h5_arrays),
+    ".mat": _reader(mat_arrays),
     ".csv": _read_csv,
 }
 WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -76,24 +75,31 @@ def load_swipe(file: str) -> SwipeRecording:
 @lru_cache(maxsize=4)
 def _load_swipe(file: str, changed: int) -> SwipeRecording:
     """As `load_swipe`, cached until the file changes."""
+    from scipy.ndimage import find_objects, label
+
     raw = _read(file)
-    rate = checks.number("rate", _scalar(raw["rate"]), "Hz", above=0, most=1e6)
-    metre_per_count = checks.number("metre_per_count", _scalar(raw["metre_per_count"]), "m", above=0, most=1e-3)
+    rate, metre_per_count = (
+        checks.number(key, raw[key].item() if raw[key].size == 1 else raw[key], unit, above=0, most=most)
+        for key, unit, most in (("rate", "Hz", 1e6), ("metre_per_count", "m", 1e-3))
+    )
     lateral, normal = (_row(raw, key, "iuf", "numbers in N").astype(float) for key in ("lateral_force", "normal_force"))
     position = unwrap_counts(_row(raw, "encoder", "iu", "integer counts").astype(np.uint32)) * metre_per_count
     if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
         sizes = f"{position.size}, {lateral.size}, {normal.size}"
         bound = f"must be equal and more than {UNLOADED} s at {rate:g} Hz"
         raise ValueError(f"encoder, lateral_force, normal_force have {sizes} samples: {bound}")
-    load = _load(normal, rate)
-    touching = _touching(load, rate)
+    departure = _smooth(normal - np.median(normal[: int(UNLOADED * rate)]), rate)
+    large = np.abs(departure) > np.abs(departure).max() / 2
+    load = departure * (-1.0 if departure[large].sum() < 0 else 1.0)  # positive for a press, by the larger part of it
+    touching = np.zeros(load.size, bool)
+    for (run,) in find_objects(label(load > RELEASE)[0]):
+        touching[run] = load[run].max() > TOUCH and run.stop - run.start >= SHORTEST_TOUCH * rate
     if not touching.any():
         bound = f"must be > {TOUCH} N for {SHORTEST_TOUCH} s to be a touch"
         raise ValueError(f"normal_force departs by {np.abs(load).max():.3g} N from its level before: {bound}")
     first, last = position[touching].min(), position[touching].max()
-    if last - first > MOST_TRAVEL:
-        bound = f"must be <= {MOST_TRAVEL:g} m; is metre_per_count right?"
-        raise ValueError(f"travels {last - first:.3g} m in contact: {bound}")
+    if (travel := last - first) > MOST_TRAVEL:
+        raise ValueError(f"travels {travel:.3g} m in contact: must be <= {MOST_TRAVEL:g} m; is metre_per_count right?")
     position = position - (first + last) / 2
     lateral = lateral - np.median(lateral[~touching])
     sliding, speed = _sliding(position, lateral, touching, rate)
@@ -118,10 +124,6 @@ def _read(file: str) -> dict[str, Array]:
     return raw
 
 
-def _scalar(array: Array) -> Any:
-    return array.item() if array.size == 1 else array
-
-
 def _row(raw: dict[str, Array], key: str, kinds: str, bound: str) -> Array:
     """Return an array that is a row of finite numbers of the dtype `kinds`."""
     row = raw[key]
@@ -138,22 +140,6 @@ def _smooth(values: Array, rate: float) -> Array:
     from scipy.ndimage import uniform_filter1d
 
     return uniform_filter1d(values, 2 * max(round(SMOOTHING * rate / 2), 1) + 1, mode="nearest")
-
-
-def _load(normal_force: Array, rate: float) -> Array:
-    """Return the load (N), positive for a press: signed by the larger part of what departs from the unloaded level."""
-    departure = _smooth(normal_force - np.median(normal_force[: int(UNLOADED * rate)]), rate)
-    large = np.abs(departure) > np.abs(departure).max() / 2
-    return departure * (-1.0 if departure[large].sum() < 0 else 1.0)
-
-
-def _touching(load: Array, rate: float) -> Array:
-    from scipy.ndimage import find_objects, label
-
-    touching = np.zeros(load.size, bool)
-    for (run,) in find_objects(label(load > RELEASE)[0]):
-        touching[run] = load[run].max() > TOUCH and run.stop - run.start >= SHORTEST_TOUCH * rate
-    return touching
 
 
 def _sliding(position: Array, lateral: Array, touching: Array, rate: float) -> tuple[Array, float]:
