@@ -12,7 +12,6 @@ from hapticrender import checks
 from hapticrender.bands import Bands
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.methods import method_named
-from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import supervised
 from hapticrender.driver_checks import check_driver
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -67,7 +66,7 @@ class BaseRenderer:
             controller=partial(design, bands),
             design=design,
             shape=self.shape(setup),
-            probe=self.probe(setup, model) if self.probes(setup, device) else None,
+            probe=self.probe(setup, model, device),
         )
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
@@ -108,13 +107,9 @@ class BaseRenderer:
         """Return the device model with the scene's demand, where motion and drive can be supervised by it."""
         return model
 
-    def probes(self, setup: Setup, driver: Driver) -> bool:
-        """Whether the device is probed before the loop closes."""
-        return False
-
-    def probe(self, setup: Setup, model: DeviceModel) -> Callable[[Driver], None]:
-        """Return what probes an open device: of a plate, its wiring."""
-        return partial(probe_plate, model=model)
+    def probe(self, setup: Setup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
+        """Return what probes the open device before the loop closes; None where nothing does."""
+        return None
 
     def waveform(self, setup: Setup, texture: Texture) -> Waveform:
         """Return the target waveform of `texture` over time (s) and position (m), in the device's quantity."""

@@ -12,7 +12,7 @@ each bank takes its share while the frequency goes up and down, by the fades tha
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -136,10 +136,12 @@ class HybridRenderer(BaseRenderer):
         """Return the simulated device with the scene's finger on it."""
         plate = self._plate.plant(setup.plate, seed)
         own = seed + 2**32  # noise of its own
-        if setup.friction is None:
-            screen = ElectroadhesionScreen(setup.screen.simulated, setup.scene.finger, own)
-        else:
-            screen = self._screen.plant(setup.friction, own)
+        silent = setup.friction is None
+        screen = (
+            ElectroadhesionScreen(setup.screen.simulated, setup.scene.finger, own)
+            if silent
+            else self._screen.plant(setup.friction, own)
+        )
         return HybridPlant(plate, screen, setup.velocity_per_force)
 
     def connect(self, setup: HybridSetup, driver: Driver) -> Driver:
@@ -154,10 +156,10 @@ class HybridRenderer(BaseRenderer):
         late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
         return HybridDriver(driver, shape, displacement, setup.velocity_per_force, late)
 
-    def probes(self, setup: HybridSetup, driver: Driver) -> bool:
-        """Whether its plate is probed, unless driver or scene say no."""
+    def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
+        """Return what probes its plate, unless driver or scene say no."""
         part = _part_of(driver, COILS, SENSORS, "plate")
-        return bool(getattr(driver, "probe", True)) and self._plate.probes(setup.plate, part)
+        return self._plate.probe(setup.plate, model, part) if getattr(driver, "probe", True) else None
 
     def shape(self, setup: HybridSetup) -> Any:
         """Return the square root for the screen's share of the scene."""
@@ -166,10 +168,10 @@ class HybridRenderer(BaseRenderer):
     def device_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
         """Return the device models of the two parts behind `driver`."""
         plate = self._plate.device_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
-        friction = None
-        if setup.friction is not None:
-            friction = self._screen.device_model(setup.friction, _part_of(driver, 1, 1, "screen"))
-        if friction is not None and (setup.bands.wavenumber > 0.0).any():  # fixed carriers keep their share
+        if setup.friction is None:
+            return _side_by_side(plate, None, setup.velocity_per_force)
+        friction = self._screen.device_model(setup.friction, _part_of(driver, 1, 1, "screen"))
+        if (setup.bands.wavenumber > 0.0).any():  # fixed carriers keep their share
             start = setup.settings.start
             plate = replace(plate, highest_frequency=start, highest_edge=2.0)
             friction = replace(friction, lowest_frequency=2 * start)
@@ -220,17 +222,13 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
     if whole.envelope is None and not locked.all():
         raise ValueError("texture: a recording over time is not supported on a hybrid: use one over position")
     high = settings.share_of_screen(whole.frequency)
-    shares = np.where(locked, 1.0, 1.0 - high), np.where(locked, 1.0, high)  # locked: the fades of the banks share
-
-    def part(share: Array) -> Bands:
+    parts: dict[str, Any] = {}
+    for name, own in (("plate", 1.0 - high), ("friction", high)):
+        share = np.where(locked, 1.0, own)  # locked: the fades of the banks share
+        index = parts[f"{name}_index"] = np.flatnonzero(share > 0.0)
         envelope = None if whole.envelope is None else share * whole.envelope
-        return replace(whole, envelope=envelope).select(share > 0.0, unfelt=())
-
-    index = [np.flatnonzero(share > 0.0) for share in shares]
-    plate_bands, friction_bands = map(part, shares)
-    return CombinedBands(
-        **vars(whole), plate=plate_bands, friction=friction_bands, plate_index=index[0], friction_index=index[1]
-    )
+        parts[name] = replace(whole, envelope=envelope).select(index, unfelt=())
+    return CombinedBands(**vars(whole), **parts)
 
 
 def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
@@ -239,17 +237,13 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     with inside("render"):
         check_names(scene.rendering, own | of_screen, scene_keys("render"))
         settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
-    with inside("device"):
-        plate, screen = _split_table(scene.profile, own | of_screen)
-    with inside("simulation"):
-        of_plate, on_screen = _split_table(scene.simulation, own | of_screen)
     rendering = {key: value for key, value in scene.rendering.items() if key not in own}
-    probe = {key: value for key, value in rendering.items() if key == "probe"}
-    return (
-        settings,
-        replace(scene, profile=plate, simulation=of_plate, rendering=probe),
-        replace(scene, profile=screen, simulation=on_screen, rendering=rendering, limits={}),  # which are the plate's
-    )
+    plate: dict[str, Any] = {"rendering": {key: value for key, value in rendering.items() if key == "probe"}}
+    screen: dict[str, Any] = {"rendering": rendering, "limits": {}}  # which are the plate's
+    for field, table in (("profile", "device"), ("simulation", "simulation")):
+        with inside(table):
+            plate[field], screen[field] = _split_table(getattr(scene, field), own | of_screen)
+    return settings, replace(scene, **plate), replace(scene, **screen)
 
 
 def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:

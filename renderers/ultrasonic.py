@@ -73,13 +73,10 @@ class UltrasonicRenderer(FrictionRenderer):
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""
         return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed), _demand(setup))
 
-    def probes(self, setup: SurfaceSetup, driver: Driver) -> bool:
-        """Whether a surface is probed: one that senses, unless driver or scene say no."""
-        return bool(setup.settings.probe and getattr(driver, "probe", True) and driver.sensed_channels)
-
-    def probe(self, setup: SurfaceSetup, model: DeviceModel) -> Callable[[Driver], None]:
-        """Return what probes an open surface: its response on the resonance."""
-        return partial(probe_resonance, mode=setup.assumed.mode)
+    def probe(self, setup: SurfaceSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
+        """Return what probes the response on the resonance of a surface that senses, unless driver or scene say no."""
+        allowed = setup.settings.probe and getattr(driver, "probe", True) and driver.sensed_channels
+        return partial(probe_resonance, mode=setup.assumed.mode) if allowed else None
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""

@@ -7,11 +7,14 @@ identify` finds them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 from hapticrender.bands import Bands
 from hapticrender.checks import require
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.probe import probe_plate
 from hapticrender.control.supervisor import governed
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
@@ -54,10 +57,14 @@ class VibrotactileRenderer(BaseRenderer):
         check_path(setup.scene, setup.simulated.glass_length / 2, "glass")
         return Plate(setup.simulated, setup.scene.finger, seed)
 
-    def probes(self, setup: PlateSetup, driver: Driver) -> bool:
-        """Whether a plate is probed: one of two coils and two sensors, unless driver or scene say no."""
+    def probe(self, setup: PlateSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
+        """Return what probes the wiring of two coils and two sensors, unless driver or scene say no."""
         allowed = setup.probe and getattr(driver, "probe", True)
-        return allowed and setup.assumed.coils == driver.sensed_channels == 2
+        return (
+            partial(probe_plate, model=model)
+            if allowed and setup.assumed.coils == driver.sensed_channels == 2
+            else None
+        )
 
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
