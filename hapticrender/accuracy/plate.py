@@ -343,18 +343,11 @@ def identified(bench: Bench) -> dict[str, float]:
     return worst
 
 
-def in_blocks(
-    case: Callable[[Bench], dict[str, float]], block: int, rate: float, **plate: Any
-) -> Callable[[Bench], dict[str, float]]:
-    """Return a case in blocks at a rate (Hz), on a plate that differs."""
-    return lambda bench: case(bench.of(block=block, rate=rate, delay=block, **plate))
-
-
 worst_touch = partial(touch, fingers=FINGERS[1::2], at=PLACES[::2])  # heavy, in the middle and far off: as all 12
 CASES: dict[str, Case] = {
     "white": noise,
     "white wrong": lambda bench: noise(bench.of(stated=2, **WRONG)),
-    "white 48 kHz": in_blocks(noise, 64, 48e3),
+    "white 48 kHz": lambda bench: noise(bench.of(block=64, rate=48e3)),
     "waves": waves,
     "random fingers": random,
     "free": lambda bench: free(bench.of(**RIGID)),
@@ -367,8 +360,8 @@ CASES: dict[str, Case] = {
     "touch": touch,
     "touch rigid": lambda bench: touch(bench.of(**RIGID)),
     "touch wrong": lambda bench: worst_touch(bench.of(**WRONG | RIGID)),
-    "touch blocks": in_blocks(worst_touch, 25, 5e3, **RIGID),
-    "touch 48 kHz": in_blocks(worst_touch, 64, 48e3, **RIGID),
+    "touch blocks": lambda bench: worst_touch(bench.of(block=25, **RIGID)),
+    "touch 48 kHz": lambda bench: worst_touch(bench.of(block=64, rate=48e3, **RIGID)),
     "touch 10 um": lambda bench: touch(bench.of(**RIGID), 10e-6, FINGERS[1::2]),
     "small": lambda bench: small(bench.of(**RIGID)),
     "wobble": wobble,

@@ -58,9 +58,8 @@ class Figure(NamedTuple):
         return bool(self.value <= self.target.aim)
 
 
-PLATES: tuple[
-    tuple[str, str, str, dict[str, tuple[float, float]]], ...
-] = (  # case, what, unit; bound and aim of each key
+Rows = tuple[tuple[str, str, str, dict[str, tuple[float, float]]], ...]  # case, what, unit; bound and aim of each key
+PLATES: Rows = (
     ("white", "white noise, heavy finger sliding", "%", {"free": (1, 0.4), "free, end": (2, 0.7)}),
     ("white", "white noise, heavy finger sliding", "%", {"slide": (1, 0.5), "slide, end": (2, 0.9)}),
     ("white wrong", "plate wrong in all but the delay", "%", {"free": (1.5, 0.8), "free, end": (4, 2.3)}),
@@ -85,18 +84,8 @@ PLATES: tuple[
     ("touch", "the same: left after 0.6 s (a limit cycle would show)", "%", {"left": (5, 1)}),
     ("touch rigid", "the same, rigid plate", "%", {"centre": (9, 6), "end": (22, 12)}),
     ("touch wrong", "the same, rigid, wrong in everything, heavy fingers", "%", {"centre": (11, 11), "end": (22, 22)}),
-    (
-        "touch blocks",
-        "touch, rigid plate, heavy fingers, blocks of 25 at 5 kHz",
-        "%",
-        {"centre": (40, 40), "end": (80, 80)},
-    ),
-    (
-        "touch 48 kHz",
-        "touch, rigid plate, heavy fingers, blocks of 64 at 48 kHz",
-        "%",
-        {"centre": (40, 40), "end": (80, 80)},
-    ),
+    ("touch blocks", "rigid, heavy fingers, blocks of 25 at 5 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),
+    ("touch 48 kHz", "rigid, heavy fingers, blocks of 64 at 48 kHz", "%", {"centre": (40, 40), "end": (80, 80)}),
     ("touch 10 um", "touch, rigid plate, 10 um under 0.8 N", "%", {"centre": (30, 30), "end": (70, 70)}),
     ("small", "rigid plate, 1 um at 20 Hz under 0.5 N", "%", {"pressed": (0.5, 0.5)}),
     ("small", "rigid plate, mean of a target of 0.1 um", "%", {"0.1 um": (1, 1)}),
@@ -110,39 +99,38 @@ PLATES: tuple[
     ("identified", "the same, bending mode", "Hz", {"frequency": (0.5, 0.5)}),
     ("identified", "the same, bending mode", "%", {"coupling": (5, 5)}),
 )
-TARGETS = (
-    *(
-        Target(case, key, f"{what}: {key}", unit, *figures)
-        for case, what, unit, rows in PLATES
-        for key, figures in rows.items()
-    ),
-    Target("electroadhesion: area", "error", "area +-30 %, gap 0.5-3 um, rms of the force", "%", 3.0, 1.0),
-    Target("electroadhesion: harmonic", "second", "second harmonic of friction, with the square root", "%", 0.1, 0.05),
-    *(
-        Target(f"{device}: {case}", key, what, unit, bound, aim)
-        for device in ("electroadhesion", "ultrasonic")
-        for case, key, what, unit, bound, aim in (
-            ("tones", "error", "friction tones, 20-400 Hz, three fingers, rms", "%", 1.0, 0.5),
-            ("comb", "error", "20 bands, 20-400 Hz, amplitudes", "dB", -33.0, -39.0),
-            ("swipe", "swipe", "ridges under swipes of 3 Hz, rms where judged", "%", 2.5, 1.1),
-            ("swipe", "fro", "ridges under a finger that goes to and fro", "%", 1.0, 0.5),
-        )
-    ),
-    *(
-        Target(f"ultrasonic: {case}", key, f"{what} (independent of the method)", unit, bound, aim)
-        for case, key, what, unit, bound, aim in (
-            ("step", "response", "amplitude's response to 5 %", "ms", 2.5, 1.25),
-            ("modulation", "gain", "AM at 400 Hz, off by", "dB", 1.0, 0.5),
-            ("heat", "error", "amplitude while warming by 10 K", "%", 2.0, 1.0),
-            ("touch", "unlocked", "unlocked after a touch or lift", "ms", 20.0, 5.0),
-            ("press", "peak", "load within 1 ms, peak of amplitude", "%", 2.0, 1.0),
-            ("touch", "back", "amplitude back within 2 %", "ms", 8.0, 2.5),
-        )
-    ),
-    *(
-        Target("every device: velocity", device, f"one texture, skin velocity on {device}", "%", 5.0, 1.0)
-        for device in ("vt-plate", "electroadhesion", "ultrasonic")
-    ),
+FRICTION: Rows = (  # of screens and ultrasonic plates alike
+    ("tones", "friction tones, 20-400 Hz, three fingers, rms", "%", {"error": (1, 0.5)}),
+    ("comb", "20 bands, 20-400 Hz, amplitudes", "dB", {"error": (-33, -39)}),
+    ("swipe", "ridges under swipes of 3 Hz, rms where judged", "%", {"swipe": (2.5, 1.1)}),
+    ("swipe", "ridges under a finger that goes to and fro", "%", {"fro": (1, 0.5)}),
+)
+SCREEN: Rows = (
+    ("area", "area +-30 %, gap 0.5-3 um, rms of the force", "%", {"error": (3, 1)}),
+    ("harmonic", "second harmonic of friction, with the square root", "%", {"second": (0.1, 0.05)}),
+    *FRICTION,
+)
+ULTRASONIC: Rows = (
+    *FRICTION,
+    ("step", "amplitude's response to 5 % (independent of the method)", "ms", {"response": (2.5, 1.25)}),
+    ("modulation", "AM at 400 Hz, off by (independent of the method)", "dB", {"gain": (1, 0.5)}),
+    ("heat", "amplitude while warming by 10 K (independent of the method)", "%", {"error": (2, 1)}),
+    ("touch", "unlocked after a touch or lift (independent of the method)", "ms", {"unlocked": (20, 5)}),
+    ("press", "load within 1 ms, peak of amplitude (independent of the method)", "%", {"peak": (2, 1)}),
+    ("touch", "amplitude back within 2 % (independent of the method)", "ms", {"back": (8, 2.5)}),
+)
+DEVICES = ("vt-plate", "electroadhesion", "ultrasonic")
+EVERY: Rows = (("velocity", "one texture, skin velocity", "%", dict.fromkeys(DEVICES, (5, 1))),)
+TARGETS = tuple(
+    Target(f"{device}: {case}" if device else case, key, f"{what}: {key}", unit, *figures)
+    for device, table in (
+        ("", PLATES),
+        ("electroadhesion", SCREEN),
+        ("ultrasonic", ULTRASONIC),
+        ("every device", EVERY),
+    )
+    for case, what, unit, rows in table
+    for key, figures in rows.items()
 )
 CASES = (*plate.CASES, *friction.CASES)
 METHOD_FREE = frozenset(("identified", *friction.WITHOUT_METHOD))  # cases that do not depend on the method
