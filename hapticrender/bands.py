@@ -1,10 +1,8 @@
 """Bands: carriers with their phases, and the complex target envelopes on them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -98,7 +96,7 @@ class Bands:
         return len(self.frequency)
 
     @classmethod
-    def none(cls, *, spatial: bool) -> Bands:
+    def none(cls, *, spatial: bool) -> Self:
         """No carriers: the whole waveform is the target; it follows the finger if `spatial`."""
         return cls(frequency=np.zeros(0), wavenumber=np.zeros(0), phase=np.zeros(0), spatial=spatial)
 
@@ -107,7 +105,7 @@ class Bands:
         """Whether the whole target follows the finger."""
         return self.spatial or (len(self) > 0 and bool((self.wavenumber > 0.0).all()))
 
-    def select(self, which: Array, **changes: Any) -> Bands:
+    def select(self, which: Array, **changes: Any) -> Self:
         """Bands at the indices, or where the mask, `which`, with `changes` of other fields."""
         columns = {name: column[which] for name in _COLUMNS if (column := getattr(self, name)) is not None}
         return replace(self, **{**columns, **changes})

@@ -1,7 +1,5 @@
 """Validation of arguments and parameters: an error names key, value, bound and unit in one line."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import os

@@ -6,8 +6,6 @@ failed or no permission to write, 130 interrupted; each error is one line, with
 its traceback where Python runs with ``-X dev``.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

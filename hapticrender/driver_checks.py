@@ -1,7 +1,5 @@
 """Checks of a driver and of every block that it returns."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 The sources are those of ``drivers/firmware``; they play what method ``inverse`` designs for a plate.
 """
 
-from __future__ import annotations
-
 import math
 from importlib.resources import files
 from pathlib import Path

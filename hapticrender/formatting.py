@@ -1,7 +1,5 @@
 """Format numbers, bands and tables as text, the same on the command line, in reports and on pages."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Friction that is inferred: what an attraction or an amplitude makes of it behind the lag of the contact."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

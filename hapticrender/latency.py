@@ -10,8 +10,6 @@ the origin (least squares, weighted by the magnitude of S, 0.05 to 0.4 of the ra
 for in the loop's models a drive is held for a sample, and so acts half a sample after its number.
 """
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

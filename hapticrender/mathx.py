@@ -1,7 +1,5 @@
 """Mathematics that several packages need: design-time functions in numpy, and their compiled counterparts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -3,8 +3,6 @@
 ``ProcessPoolExecutor()`` of `concurrent.futures` is one, ``Client(address).get_executor()`` of dask another.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial

@@ -1,7 +1,5 @@
 """Render scenes against the device models and judge each: within its tolerance or not, and by which figure."""
 
-from __future__ import annotations
-
 import itertools
 import multiprocessing
 import os
@@ -21,7 +19,7 @@ from dataclasses import asdict, dataclass, field
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Self, TextIO
 from xml.etree import ElementTree
 
 from hapticrender import __version__, defaults
@@ -69,7 +67,7 @@ class Verdict:
     summary: Mapping[str, Any] = field(default_factory=dict, repr=False)  # ``Recording.summary()``
 
     @classmethod
-    def of(cls, summary: Mapping[str, Any], elapsed: float, warnings: tuple[str, ...] = ()) -> Verdict:
+    def of(cls, summary: Mapping[str, Any], elapsed: float, warnings: tuple[str, ...] = ()) -> Self:
         """Take the verdict from ``Recording.summary()``; `elapsed` is in s."""
         keys = ("scene", "device", "method", "seed", "verdict", "reason", "tolerance")
         own = {key: summary[key] for key in keys} | summary["worst"]

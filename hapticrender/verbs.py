@@ -1,7 +1,5 @@
 """The verbs of the command line; `hapticrender.cli` reads their arguments."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """Base of the renderers: opens a scene on a device, and reads its tables."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace

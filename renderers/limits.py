@@ -1,7 +1,5 @@
 """Limits common to all devices: of carriers by the rate, of targets by drive and sensors, of the finger's path."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import partial

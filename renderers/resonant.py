@@ -1,7 +1,5 @@
 """A user's resonant plate as a driver of friction, through the friction law and the amplitude's own controller."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Drivers behind a static characteristic of their drive, which a renderer puts before a user's device."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ friction law makes it an amplitude of the plate's mode, which the same controlle
 driver of your own gets that carrier (V) at its own rate, and senses the mode's displacement (m), or nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

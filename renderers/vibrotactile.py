@@ -5,8 +5,6 @@ drive is the current of each coil (A).  Any plate with one or two coils is descr
 identify` finds them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

@@ -5,8 +5,6 @@ that slides at 80 mm/s, unless a case states otherwise.  Those of amplitude are 
 "carrier"; its loop is that of the device, whatever method makes the friction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial

@@ -6,14 +6,12 @@ amplitude by least squares with offset and slope over windows of max(20 ms, 2/f)
 or lifts, at random phases.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -104,7 +102,7 @@ class Bench:
     delay: int = 0
     seed: int = 1
 
-    def of(self, block: int = 1, stated: int = 0, **plate: Any) -> Bench:
+    def of(self, block: int = 1, stated: int = 0, **plate: Any) -> Self:
         """Return the same bench with a plate that differs, or in blocks."""
         changed = replace(self.plate, **{"delay": block, **plate})
         return replace(self, plate=changed, block=block, delay=stated)

@@ -1,7 +1,5 @@
 """What the cases of plates play, seeded: waveforms of 5 um rms in time, a modulated tone, and the path of a finger."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The plate of the library behind a driver that hides it, for cases of the accuracy suite."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Self
 

@@ -6,8 +6,6 @@ Hz/s, as 3 Hz and +-50 mm/s sweep by 1885 Hz/s over 0.5 mm; a touch the time con
 half of the bound (6 dB), but 1 % of area and velocity, and 2.5 ms of a touch, the amplitude's response.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple

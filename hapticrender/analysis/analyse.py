@@ -1,7 +1,5 @@
 """The finger out of a recording: contact, then the plate where nothing touches it, then the finger on that plate."""
 
-from __future__ import annotations
-
 import itertools
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Contact from the force on the glass: two thresholds, and the force at rest followed while nothing touches."""
 
-from __future__ import annotations
-
 import math
 from statistics import NormalDist
 

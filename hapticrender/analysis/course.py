@@ -13,10 +13,9 @@ the motion (`MotionFilter`), so that with D the heave row of ``M s^2 + C s + K``
 The rows differ from those that Grigorii et al. 2021 print, (m/2) x'' -+ (I/2) theta'', whose units do not agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -47,7 +46,7 @@ class Signals:
     force: Array  # N
 
     @classmethod
-    def of(cls, columns: Array) -> Signals:
+    def of(cls, columns: Array) -> Self:
         """Signals of the first eight columns (..., >= 8): displacement, velocity, acceleration, force."""
         return cls(*(columns[..., i : i + 2] for i in range(0, 8, 2)))
 
@@ -82,7 +81,7 @@ class Course:
     @classmethod
     def of(
         cls, plate: PlateParameters, uncertainty: Mapping[str, float] | None = None, duration: float = 0.0
-    ) -> Course:
+    ) -> Self:
         """Parameters of a profile; `uncertainty` is standard, in their units, and `UNCERTAINTY` where it has none.
 
         Over a recording of a `duration` (s) stiffness and damping may drift by `DRIFT`, one standard deviation.

@@ -1,7 +1,5 @@
 """The finger's force from a plate's signals: motion and its derivatives, the drive's force, and their noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Growth of the finger's impedance with the normal load, a power law at each frequency."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan, sqrt

@@ -1,7 +1,5 @@
 """Amplitudes of carriers in windows, all carriers and a slow drift at once, with known noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Fit finger models to measured impedances: order, and parameters with intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, nan, sqrt

@@ -1,7 +1,5 @@
 """Write what the analysis of a recording found: tables as CSV, the rest as JSON, and a summary as text."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Write the page about a measured finger: its pictures, the fitted parameters, the exponents, what is missing."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from html import escape
 from math import isfinite

@@ -1,7 +1,5 @@
 """Draw what the analysis of recordings found: load and impedance over time, over the load, and over frequency."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from collections.abc import Callable, Mapping, Sequence

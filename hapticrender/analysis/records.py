@@ -1,7 +1,5 @@
 """What the analysis of recordings finds, each number with its standard error."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any

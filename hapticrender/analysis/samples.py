@@ -1,7 +1,5 @@
 """Measured impedances of one or several recordings as rows, without what is masked."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import inf
 from typing import NamedTuple

@@ -6,8 +6,6 @@ of a smoothed signal are the signal under g' and g'', exactly, so that motion an
 Kernels end `REACH` spreads from their middle, where g has fallen to 4e-6.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

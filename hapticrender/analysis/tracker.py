@@ -14,8 +14,6 @@ Standard errors: white noise of standard deviation s_c, s_r in heave and rocking
 so that the position is lost as 1/W.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cached_property
 

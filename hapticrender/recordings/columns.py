@@ -1,7 +1,5 @@
 """Read recordings of other programs: name the columns of a CSV, MAT, HDF5 or NPZ file, with their scales."""
 
-from __future__ import annotations
-
 import csv
 import os
 from array import array

@@ -1,7 +1,5 @@
 """Read and write recordings in several formats."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import math

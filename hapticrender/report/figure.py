@@ -1,7 +1,5 @@
 """Share among all pictures: colours, style, a figure apart from pyplot, its legend and its file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Write what one rendered scene leaves in a folder: sound, picture, journal, figures, itself."""
 
-from __future__ import annotations
-
 import errno
 import os
 import warnings

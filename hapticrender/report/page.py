@@ -1,7 +1,5 @@
 """Write one page about many rendered scenes: plain HTML that opens from a file, without script, server or network."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Show progress: a percentage on a terminal, and a line a scene anywhere."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO

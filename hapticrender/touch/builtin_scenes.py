@@ -1,7 +1,5 @@
 """The built-in scenes: the demo renders them and ``validate`` judges by them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -4,10 +4,8 @@ Everything here runs in *recorded* seconds.  A spatial recording is read at
 ``x / speed`` with the speed at which it was recorded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -40,7 +38,7 @@ class Curve:
         return next_fast_len(int(np.ceil(POINTS * ROLL_OFF * high * (count - 1) * step)) + 2, real=True)
 
     @classmethod
-    def band_limited(cls, values: Array, step: float, low: float, high: float) -> Curve:
+    def band_limited(cls, values: Array, step: float, low: float, high: float) -> Self:
         """Keep `low` to `high` (Hz) of `values`, on a table fine enough for `at`.
 
         The cosine transform (DCT-I) sees exactly the reflected continuation, so

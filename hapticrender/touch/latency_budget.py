@@ -11,8 +11,6 @@ variance R the variance R C(h) S C(h)^T, S = A S A^T + B B^T.  h runs from the l
 after a lost one.  Both are exact for the filter at its constant gain; gate, irregular times and lifts are left out.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import product
 

@@ -12,8 +12,6 @@ A sample beyond `GATE` standard errors of what is predicted is left out, unless 
 finger was put elsewhere, stopped or turned at once, and the filter starts afresh from these two.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 Amplitudes are peaks (m, m/s, N) of sinusoids; levels are dB above the classic detection threshold.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from hapticrender import checks

@@ -1,7 +1,5 @@
 """Reads and writes the TOML of scenes and profiles (the standard library only reads it)."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A finger slid over a real surface: the recording of a tribometer, and what can be read from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
