@@ -31,7 +31,7 @@ from hapticrender.formatting import as_json, printable
 from hapticrender.loop import Terminated, prepare
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
-from hapticrender.report.progress import progress as progress_of
+from hapticrender.report.text import progress as progress_of
 from hapticrender.report.text import verdict as sentence
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.scene import Scene, distinct_names

@@ -24,8 +24,7 @@ from hapticrender.recordings.recording import Recording
 from hapticrender.report import outputs
 from hapticrender.report.outputs import check_file, check_folder
 from hapticrender.report.page import write_page
-from hapticrender.report.progress import progress
-from hapticrender.report.text import conditions, describe, figures, overview, verdict
+from hapticrender.report.text import conditions, describe, figures, overview, progress, verdict
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.device_profile import DeviceProfile
 from hapticrender.touch.scene import Scene

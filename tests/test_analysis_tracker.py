@@ -7,7 +7,7 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
-from hapticrender.analysis.force import MotionFilter
+from hapticrender.analysis.course import MotionFilter
 from hapticrender.analysis.lock_in import demodulate, tile, window_length
 from hapticrender.analysis.records import LOADED
 from hapticrender.analysis.smoothing import LocalLine, convolve, derivative_kernels, half_width, spread_of

@@ -10,9 +10,8 @@ import pytest
 from scipy.signal import resample_poly
 from strangers_plate import StrangersPlate
 
-from hapticrender.accuracy.plate import FINGERS, Bench, touching
+from hapticrender.accuracy.plate import FINGERS, Bench, SimulatedPlate, touching
 from hapticrender.accuracy.signals import recorded
-from hapticrender.accuracy.simulated import SimulatedPlate
 from hapticrender.accuracy.suite import run_suite
 from hapticrender.touch.finger import Finger
 

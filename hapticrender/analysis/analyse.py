@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hapticrender.analysis.course import Course, Rest, Signals, impedance_of, regress, rest_of, track_of
-from hapticrender.analysis.force import MotionFilter, at_least, sensor_noise
+from hapticrender.analysis.course import Course, MotionFilter, Rest, Signals, at_least, sensor_noise
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, FingerRecord, Impedance, Segment, Touch, joined
 from hapticrender.analysis.smoothing import LEAST_SPREAD, spread_of
@@ -92,8 +91,8 @@ def analyse_finger(
         lines = signals.unloaded(np.abs(slow) < threshold, slow, frequency, length, threshold / 2)
     rest = None
     if len(lines.time):
-        course = regress(course, lines, signals.noise) if frequency.size else course
-        rest = rest_of(course, lines)
+        course = course.regressed(lines, signals.noise) if frequency.size else course
+        rest = course.rest(lines)
     touch, tracker = signals.track(course, rest)
     spoiled = _spoiled(recording)[: len(touch.contact)]
     touch = replace(touch, contact=np.where(spoiled, DOUBTFUL, touch.contact))
@@ -105,7 +104,7 @@ def analyse_finger(
         segments=tuple(
             Segment(int(touch.contact[i]), i / rate, j / rate) for i, j in itertools.pairwise(edges.tolist())
         ),
-        plate=track_of(course, len(drive) / rate),
+        plate=course.track(len(drive) / rate),
         impedance=impedance,
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
         notes=tuple(_notes(recording, course, touch, rest, impedance, threshold)),
@@ -236,7 +235,7 @@ class _Signals:
         lever = np.nan_to_num(place) / a * self.columns[: len(place), 3]
         columns = np.column_stack([self.columns[: len(place)], lever])
         lines = self.lines(columns, starts, length, frequency)
-        found = impedance_of(course, lines, self.noise, load, middle, spread, gain)
+        found = course.impedance(lines, self.noise, load, middle, spread, gain)
         value, errors = (np.where(usable, each, np.nan) for each in (found.value, found.standard_error))
         return replace(found, value=value, standard_error=errors)
 

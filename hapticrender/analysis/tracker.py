@@ -20,8 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from hapticrender.analysis.contact import ContactDetector, clear_sigmas
-from hapticrender.analysis.course import Course, Rest, Signals
-from hapticrender.analysis.force import MotionFilter, at_least
+from hapticrender.analysis.course import Course, MotionFilter, Rest, Signals, at_least
 from hapticrender.analysis.records import DOUBTFUL, LOADED, UNLOADED, Series, Touch
 from hapticrender.analysis.smoothing import History, LocalLine, half_width, spread_of
 from hapticrender.bands import hold_last

@@ -1,10 +1,11 @@
-"""Verdicts, scenes and summaries as text for the command line, reports and pages."""
+"""Verdicts, scenes, summaries and progress as text for the command line, reports and pages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TextIO
 
 from hapticrender.formatting import band_label, degrees, percent, quantity, short, table
 
@@ -133,3 +134,27 @@ def describe(scene: Scene) -> str:
     sizes = ((getattr(scene.texture, key, None), unit) for key, unit in (("amplitude", "m"), ("frequency", "Hz")))
     what = " ".join([str(texture), *(short(size, unit) for size, unit in sizes if size is not None)])
     return f"{what}; finger: {motion}; {short(scene.duration, 's')} on {scene.device}"
+
+
+@contextmanager
+def progress(label: str, stream: TextIO) -> Iterator[Callable[[float, float], None]]:
+    """Yield ``tick(done, total)`` (s), which shows the share that is done on a terminal; write `label` at the end.
+
+    >>> import sys
+    >>> with progress("1/2 first", sys.stdout) as tick:
+    ...     tick(0.5, 1.0)
+    1/2 first
+    """
+    terminal = stream.isatty()
+
+    def tick(done: float, total: float) -> None:
+        if terminal:
+            print(f"\r{label} {100 * done / total:3.0f} %", end="", file=stream, flush=True)
+
+    try:
+        yield tick
+    except BaseException:
+        if terminal:
+            print(file=stream)
+        raise
+    print(f"\r{label}\x1b[K" if terminal else label, file=stream, flush=True)
