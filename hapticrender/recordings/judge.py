@@ -13,7 +13,6 @@ from hapticrender.recordings.envelopes import DIVERGING, FADE_IN, RUNAWAY, Envel
 from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
 
 if TYPE_CHECKING:
-    from hapticrender.recordings.journal import Header
     from hapticrender.recordings.recording import Recording
 
 READ_AT_ONCE = 2**18  # samples
@@ -57,8 +56,8 @@ def summary(recording: Recording) -> dict[str, Any]:
     settled = envelopes.start >= begin * (1 - 1e-9)
     judged = envelopes.judged & settled[:, None]
     bands = [_band(recording, k, judged[:, k], places) for k in range(len(recording.bands))]
-    worst = _worst(recording)
-    verdict, reason = _verdict(recording, worst)
+    worst, *clear = _worst(recording)
+    verdict, reason = _verdict(recording, worst, *clear)
     flags = _flag_counts(recording)
     residual = _mean(envelopes.residual[settled & envelopes.finite])
     names = ("device", "method", "seed", "unit", "rate", "tolerance", "motion_source")
@@ -77,14 +76,14 @@ def summary(recording: Recording) -> dict[str, Any]:
         "residual_rms": math.sqrt(residual) if residual is not None and math.isfinite(residual) else None,
         "saturated_share": flags[Flag.SATURATED] / max(1, len(recording)),
         "flags": {str(flag.name): count for flag, count in flags.items() if count},
-        "notes": _notes(recording, bands, settled),
+        "notes": _notes(recording, bands, settled, flags[Flag.TWO_TOUCHES]),
     }
 
 
 def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dict[str, Any]:
     """All figures of one band over its judged windows."""
     bands, envelopes = recording.bands, recording.envelopes
-    wavenumber, seconds = float(bands.wavenumber[k]), len(recording) / recording.rate
+    wavenumber, judged_seconds = float(bands.wavenumber[k]), len(recording) / recording.rate - judged_from(recording)
     target = envelopes.target[judged, k]
     shares = np.array(recording.header.profile or np.ones(len(places)))
     aimed = ~np.isclose(shares, 0.0)  # a place that a gradient leaves at rest has no target
@@ -101,9 +100,7 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
         "achieved": _mean(np.abs(achieved[:, 0])),
         "complex_error": float(np.sqrt(np.mean(np.abs(achieved[:, 0] - target) ** 2)) / size) if size else None,
         "phase_error": float(np.angle(lead.mean())) if some else None,
-        "settling_time": _settling_time(
-            envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * (seconds - judged_from(recording)))
-        ),
+        "settling_time": _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_seconds)),
         "judged_windows": int(judged.sum()),
     }
     for place, has_target, envelope in zip(places, aimed, achieved.T, strict=True):
@@ -146,14 +143,16 @@ def _flag_counts(recording: Recording, first: int = 0) -> dict[Flag, int]:
     return counts
 
 
-def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
+def _verdict(recording: Recording, worst: dict[str, Any], misses: bool, noise: float) -> tuple[str, str]:
     """Verdict and, where the worst figure is not the reason, what is; flags come before what cannot be judged."""
     header, found = recording.header, recording.waveform
     if header.motion_source != "unknown" and found["lost_windows"]:
         bound = f"not finite, or beyond {RUNAWAY:g} {header.unit},"
         return "failed", f"the motion is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
-    unjudged = _unjudged(recording, worst)
-    if not unjudged and worst["value"] > worst["bound"]:
+    unjudged = _unjudged(recording)
+    if not unjudged and not misses and worst["value"] > worst["bound"]:
+        unjudged = f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"
+    if not unjudged and misses:
         return "failed", _stopped(recording)
     counts = _flag_counts(recording, round(judged_from(recording) * recording.rate))
     raised = [f"{flag.name} in {count} samples" for flag, count in counts.items() if count and flag & MATTERS]
@@ -166,8 +165,8 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     return "passed", ""
 
 
-def _unjudged(recording: Recording, worst: dict[str, Any]) -> str:
-    """State why the worst figure, or its lack, says nothing; nothing where it is to be judged."""
+def _unjudged(recording: Recording) -> str:
+    """State why no figure is to be judged; nothing where the worst one is."""
     header, found = recording.header, recording.waveform
     if header.motion_source == "unknown":
         return "the device has no sensors, so its motion is not measured"
@@ -178,12 +177,7 @@ def _unjudged(recording: Recording, worst: dict[str, Any]) -> str:
         return "the texture is zero, or far below what can be felt"
     if found["share_in_band"] < LEAST:
         return f"the texture has nothing from {IN_BAND}"
-    if header.motion_source == "inferred":
-        return INFERRED
-    if worst["value"] > worst["bound"] and not _misses(recording, worst):
-        noise = percent(_noise(recording, worst))
-        return f"the worst figure is not distinct from the noise of the sensors, {noise}"
-    return ""
+    return INFERRED if header.motion_source == "inferred" else ""
 
 
 def _cut(recording: Recording) -> str:
@@ -205,40 +199,26 @@ def _unplayable(share: float) -> str:
     return f"not judged: {percent(share)} of the reference's energy, which lies outside {IN_BAND}"
 
 
-def _worst(recording: Recording) -> dict[str, Any]:
-    """Find the figure that is largest over its bound, at all places; one that distinctly misses it comes first."""
-    header, unsure, found = recording.header, _unsure(recording.header), []
+def _worst(recording: Recording) -> tuple[dict[str, Any], bool, float]:
+    """Figure that is largest over its bound, whether it distinctly misses it, and what the sensors' noise reads there.
+
+    One that distinctly misses its bound comes first.  The uncertainty of the sensors' gain is added to every figure and
+    is no noise: where that alone is over the bound, so is the figure.
+    """
+    header, found = recording.header, list[tuple[dict[str, Any], bool, float]]()
+    unsure = header.calibration if header.motion_source == "sensors" else 0.0
     for place, figures in recording.waveform["places"].items():
         for name, looser in (("waveform_error", 1.0), ("window_error", LOOSER), ("third_octave_error", LOOSER)):
             if figures and figures[name] is not None:
+                value, bound, noise = figures[name] + unsure, looser * header.tolerance, figures["sensor_noise"]
+                misses = value > bound and (figures[name] > HARDLY * noise or unsure > bound)
                 band = figures["third_octave"] if name == "third_octave_error" else IN_BAND
-                value, bound = figures[name] + unsure, looser * header.tolerance
                 where = {"band": band, "place": place.replace("_", " ")}
-                found.append({"figure": name, "value": value, "bound": bound, **where})
-    return max(found, key=lambda it: (_misses(recording, it), it["value"] / it["bound"]), default=dict(UNJUDGED))
+                found.append(({"figure": name, "value": value, "bound": bound, **where}, misses, noise))
+    return max(found, key=lambda it: (it[1], it[0]["value"] / it[0]["bound"]), default=(dict(UNJUDGED), False, 0.0))
 
 
-def _unsure(header: Header) -> float:
-    """Relative uncertainty of the motion's gain, which is added to every figure: that of the sensors it comes from."""
-    return header.calibration if header.motion_source == "sensors" else 0.0
-
-
-def _noise(recording: Recording, each: dict[str, Any]) -> float:
-    """What the noise of the sensors alone reads at the place of a figure."""
-    return float(recording.waveform["places"][each["place"].replace(" ", "_")]["sensor_noise"])
-
-
-def _misses(recording: Recording, each: dict[str, Any]) -> bool:
-    """Whether a figure is over its bound, and distinct from the noise of the sensors.
-
-    What the uncertainty of their gain adds is no noise: where that alone is over the bound, so is the figure.
-    """
-    unsure = _unsure(recording.header)
-    distinct = each["value"] - unsure > HARDLY * _noise(recording, each) or unsure > each["bound"]
-    return bool(each["value"] > each["bound"] and distinct)
-
-
-def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) -> list[str]:
+def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array, touched: int) -> list[str]:
     """State in plain sentences what limits the figures."""
     header, envelopes = recording.header, recording.envelopes
     seconds, notes = len(recording) / recording.rate, [f"left out, {text}" for text in recording.bands.unfelt]
@@ -247,7 +227,7 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array) ->
     if header.motion_source == "sensors":
         gain = f"+-{percent(header.calibration)}, which is added to every figure" if header.calibration else "not known"
         notes.append(f"the figures come from the sensors, whose errors do not show; uncertainty of their gain: {gain}")
-    if touched := _flag_counts(recording)[Flag.TWO_TOUCHES]:
+    if touched:
         notes.append(f"more than one finger touched, in {percent(touched / len(recording))} of the samples")
     if recording.least_scale < 1.0:
         notes.append(f"the drive's limit scaled the texture to {recording.least_scale:.2g} of it at the least")
