@@ -3,6 +3,7 @@
 import argparse
 import shlex
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import date
 from importlib.util import find_spec
@@ -11,7 +12,7 @@ from typing import Any
 
 from hapticrender import __version__, defaults
 from hapticrender import validate as validation
-from hapticrender.checks import number
+from hapticrender.checks import number, require
 from hapticrender.cli import fail
 from hapticrender.devices import SIMULATED, imported, naming_driver, open_driver, registered
 from hapticrender.devices import text as devices_text
@@ -146,10 +147,7 @@ def validate(arguments: argparse.Namespace) -> int:
     """Render scenes, or the accuracy suite; exit status 1 where one misses its tolerance (--strict: is not judged)."""
     if arguments.suite:
         return _suite(arguments)
-    reports = [
-        ("--json", arguments.json, validation.write_json),
-        ("--junit", arguments.junit, validation.write_junit),
-    ]
+    reports = [("--json", arguments.json, validation.write_json), ("--junit", arguments.junit, validation.write_junit)]
     references = arguments.scenes or list(builtin_scenes())
     for option, path, _ in reports:
         if path:
@@ -223,26 +221,24 @@ def identify(arguments: argparse.Namespace) -> int:
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     found: Any
     with naming_driver(arguments.driver), naming(arguments.scene or "identify"):
-        if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
-            raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
+        known = scene.device in ("vt-plate", "ultrasonic", "electroadhesion")
+        require(known, "device.kind", scene.device, "vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
         driver = _driver(arguments.driver, scene)
         if hasattr(driver, "driven_by_host"):  # a board, whose own loop is not what is identified
             driver = driver.driven_by_host()
-        simulated = registered("drivers", "simulated")
-
-        def device(plant: Any) -> Any:
-            return simulated(plant) if driver is None else driver
-
-        if scene.device == "ultrasonic":
-            with device(UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed)) as opened:
+        plants: dict[str, Callable[[], Any]] = {
+            "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
+            "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
+            "electroadhesion": lambda: ElectroadhesionScreen(setup.simulated, scene.finger, seed),
+        }
+        with registered("drivers", "simulated")(plants[scene.device]()) if driver is None else driver as opened:
+            if scene.device == "ultrasonic":
                 found = identify_resonance(opened, setup.assumed)
-        elif scene.device == "electroadhesion":
-            with device(ElectroadhesionScreen(setup.simulated, scene.finger, seed)) as opened:
+            elif scene.device == "electroadhesion":
                 found = identify_screen(opened, setup.assumed, scene.finger)
-        else:
-            with device(Plate(setup.simulated, Finger.absent(), seed)) as opened:
+            else:
                 found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
                 found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())
@@ -261,15 +257,10 @@ def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceP
     """Profile of an identified device; limits, and what else the scene states of the device, are kept."""
     own, device = scene.device_profile, found.profile()
     uncertainty = {name: value for name, value in found.uncertainty().items() if name in device}
-    return replace(
-        own,
-        name=arguments.name or arguments.out.stem,
-        measured_by=arguments.by,
-        measured_with=f"hapticrender {__version__} identify, driver {arguments.driver}",
-        measured_on=date.today(),
-        device={**own.device, **device},
-        uncertainty=uncertainty,
-    )
+    tool = f"hapticrender {__version__} identify, driver {arguments.driver}"
+    origin = {"measured_by": arguments.by, "measured_with": tool, "measured_on": date.today()}
+    name, device = arguments.name or arguments.out.stem, {**own.device, **device}
+    return replace(own, name=name, device=device, uncertainty=uncertainty, **origin)
 
 
 def finger(arguments: argparse.Namespace) -> int:
@@ -278,15 +269,14 @@ def finger(arguments: argparse.Namespace) -> int:
     from hapticrender.analysis.analyse import analyse_finger
 
     check_folder("--out", arguments.out)
-    for name in output.FILES:
-        if (arguments.out / name).exists() and not arguments.force:
-            raise ValueError(f"{str(arguments.out / name)!r}: is there: choose another folder, or add --force")
+    for path in [] if arguments.force else [arguments.out / name for name in output.FILES]:
+        if path.exists():
+            raise ValueError(f"{str(path)!r}: is there: choose another folder, or add --force")
     recording = _recording(arguments.path)
     with naming(arguments.path):
         found = analyse_finger(recording, arguments.profile, block=arguments.block, free_start=arguments.free_start)
     print(printable(output.text(found)))
-    written = [*output.write(found, arguments.out), pictures.draw(found, arguments.out)]
-    _print_written(written)
+    _print_written([*output.write(found, arguments.out), pictures.draw(found, arguments.out)])
     return 0
 
 
@@ -320,8 +310,8 @@ def export(arguments: argparse.Namespace) -> int:
     scene = _scene(arguments.scene)
     with naming(arguments.scene):
         written = export(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
-    command = f"make -C {shlex.quote(str(arguments.out))}"
-    print(f"wrote {len(written)} files into {arguments.out}; build them with: {command}")
+    folder = shlex.quote(str(arguments.out))
+    print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {folder}")
     return 0
 
 

@@ -100,45 +100,38 @@ def assemble(
     return made, join(made, signals | {"flags": np.zeros(count), "reference": np.zeros(count)})
 
 
-def _scales(chosen: Chosen) -> list[tuple[str, tuple[float, float]]]:
-    """Name, scale and offset of each column; one that is named twice is there twice."""
-    if isinstance(chosen, str):
-        chosen = [chosen]
-    found = []
-    for name, given in chosen.items() if isinstance(chosen, Mapping) else ((name, 1.0) for name in chosen):
+def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[str, Array]]:
+    """Names and values, ``scale (column - offset)``, of the columns of a signal; one named twice is there twice.
+
+    All are finite in drive and sensed; elsewhere there is one, perhaps with NaN.  Unsigned integers of a counter, of
+    time or position, are unwrapped.
+    """
+    chosen = [chosen] if isinstance(chosen, str) else chosen
+    scales = dict(chosen) if isinstance(chosen, Mapping) else dict.fromkeys(chosen, 1.0)
+    names, several, found = list(chosen), key in ("drive", "sensed"), []
+    if key == "sensed":
+        require(0 < len(names) == len(scales), key, chosen, "at least one column, and each once")
+    require(several or len(names) == 1, key, chosen, "one column")
+    for name in names:
+        given = scales[name]
         pair = given if isinstance(given, tuple | list) else (given, 0.0)
         require(len(pair) == 2, f"columns[{name!r}]", pair, "a scale, or a scale and an offset")
-        found.append((name, (number(f"scale of {name}", pair[0]), number(f"offset of {name}", pair[1]))))
-    return found
-
-
-def _column(table: Mapping[str, Any], name: str, scale: float, offset: float, counter: bool = False) -> Array:
-    """``scale (column - offset)``; unsigned integers of a `counter` are unwrapped first."""
-    if name not in table:
-        there = ", ".join(map(str, table)) or "none"
-        raise ValueError(f"column {show(name)} is missing: there are {there}")
-    values = np.squeeze(np.asarray(table[name]))
-    require(values.ndim == 1 and values.dtype.kind in "iufb", f"column {name}", table[name], "numbers, one a sample")
-    if counter and values.dtype.kind == "u":
-        values = unwrap_counts(values)
-    return scale * (values.astype(float) - offset)
-
-
-def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[str, Array]]:
-    """Names and values of the columns of a signal: all finite in drive and sensed, one, perhaps with NaN, elsewhere."""
-    scales, several = _scales(chosen), key in ("drive", "sensed")
-    names = [name for name, _ in scales]
-    if key == "sensed":
-        require(0 < len(names) == len(set(names)), key, chosen, "at least one column, and each once")
-    require(several or len(names) == 1, key, chosen, "one column")
-    found = [(name, _column(table, name, *pair, counter=key in ("position", "time"))) for name, pair in scales]
-    for name, values in found:
-        bad = np.flatnonzero(~np.isfinite(values)) if several else np.empty(0)
+        scale, offset = number(f"scale of {name}", pair[0]), number(f"offset of {name}", pair[1])
+        if name not in table:
+            there = ", ".join(map(str, table)) or "none"
+            raise ValueError(f"column {show(name)} is missing: there are {there}")
+        values = np.squeeze(np.asarray(table[name]))
+        good = values.ndim == 1 and values.dtype.kind in "iufb"
+        require(good, f"column {name}", table[name], "numbers, one a sample")
+        if not several and key != "normal_load" and values.dtype.kind == "u":
+            values = unwrap_counts(values)
+        values = scale * (values.astype(float) - offset)
+        bad: Array = np.flatnonzero(~np.isfinite(values) & several)
         if bad.size:
             cure = "cut the recording there, or interpolate"
             raise ValueError(f"{key}: column {name}: {bad.size} values are not finite, first in row {bad[0]}: {cure}")
-        finite = not np.isinf(values).any()
-        require(finite, f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
+        require(not np.isinf(values).any(), f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
+        found.append((name, values))
     return found
 
 
@@ -147,11 +140,8 @@ def _rate(rate: float | None, time: Array | None, count: int) -> float:
     if time is None:
         require(rate is not None, "rate", None, "a sampling rate in Hz, or else name a column of times with time=")
         return number("rate", rate, "Hz", least=1e-3, most=1e9)
-    bad = np.flatnonzero(~(np.diff(time) > 0))
-    if bad.size:
-        raise ValueError(
-            f"time: must rise, but row {bad[0] + 1} has {time[bad[0] + 1]:.9g} s after {time[bad[0]]:.9g} s"
-        )
+    for bad in np.flatnonzero(~(np.diff(time) > 0))[:1]:
+        raise ValueError(f"time: must rise, but row {bad + 1} has {time[bad + 1]:.9g} s after {time[bad]:.9g} s")
     measured = (count - 1) / float(time[-1] - time[0])
     chosen = measured if rate is None else number("rate", rate, "Hz", least=1e-3, most=1e9)
     off = np.abs((time - time[0]) * chosen - np.arange(count))
@@ -190,7 +180,14 @@ def _read_text(path: Path) -> dict[str, Array]:
         raise ValueError(f"{path}: nothing follows the titles in line {start}: must be lines of numbers")
     values = array("d")
     for at, line in lines[titled:]:
-        values.extend(_fields(f"{path}, line {at}", _split(line, between), names))
+        fields = _split(line, between)
+        if len(fields) != len(names):
+            raise ValueError(f"{path}, line {at}: {len(fields)} fields: must be {len(names)}, one a column")
+        for name, field in zip(names, fields, strict=True):
+            if (value := _number(field)) is None:
+                bound = "must be a number, or empty (NaN), decimals after a point"
+                raise ValueError(f"{path}, line {at}, column {name}: {show(field)}: {bound}")
+            values.append(value)
     return dict(zip(names, np.array(values).reshape(-1, len(names)).T, strict=True))
 
 
@@ -215,21 +212,6 @@ def _separator(lines: Sequence[str]) -> str | None:
 def _split(line: str, between: str | None) -> list[str]:
     """Fields of a line; the separator may stand in quotes."""
     return next(csv.reader([line], delimiter=between)) if between and '"' in line else line.split(between)
-
-
-def _fields(where: str, fields: list[str], names: list[str]) -> list[float]:
-    """Numbers of a line."""
-    if len(fields) != len(names):
-        raise ValueError(f"{where}: {len(fields)} fields: must be {len(names)}, one a column")
-    found = []
-    for name, field in zip(names, fields, strict=True):
-        value = _number(field)
-        if value is None:
-            raise ValueError(
-                f"{where}, column {name}: {show(field)}: must be a number, or empty (NaN), decimals after a point"
-            )
-        found.append(value)
-    return found
 
 
 def _number(text: str) -> float | None:

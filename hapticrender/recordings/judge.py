@@ -56,8 +56,8 @@ def summary(recording: Recording) -> dict[str, Any]:
     settled = envelopes.start >= begin * (1 - 1e-9)
     judged = envelopes.judged & settled[:, None]
     bands = [_band(recording, k, judged[:, k], places) for k in range(len(recording.bands))]
-    worst, *clear = _worst(recording)
-    verdict, reason = _verdict(recording, worst, *clear)
+    worst, misses, noise = _worst(recording)
+    verdict, reason = _verdict(recording, worst, misses, noise)
     flags = _flag_counts(recording)
     residual = _mean(envelopes.residual[settled & envelopes.finite])
     names = ("device", "method", "seed", "unit", "rate", "tolerance", "motion_source")
