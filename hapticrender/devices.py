@@ -8,7 +8,6 @@ import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
@@ -63,12 +62,9 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
 
     Raises
     ------
-    ValueError
-        There is no such driver, or it does not take the argument.
-    HapticError
-        A package that it needs is not installed, or cannot be loaded.
-    DriverError
-        The device is not there, or the callable raised what is neither a ValueError nor a TypeError.
+    ValueError, HapticError, DriverError
+        There is no such driver, or it does not take the argument; a package that it needs is not installed, or cannot
+        be loaded; the device is not there, or the callable raised what is neither a ValueError nor a TypeError.
 
     Examples
     --------
@@ -87,11 +83,17 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
         factory = imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
-            options = {"overwrite": True} if overwrite and "overwrite" in inspect.signature(factory).parameters else {}
-            made = factory(*[argument] * bool(colon), **_calibration(factory, profile), **options)
+            taken = inspect.signature(factory).parameters if profile or overwrite else {}
+            offered = {
+                **(vars(profile.calibration) if profile else {}),
+                "profile": profile,
+                "overwrite": overwrite or None,
+            }
+            options = {name: value for name, value in offered.items() if name in taken and value is not None}
+            made = factory(*[argument] * bool(colon), **options)
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
-    warn_of_calibration(text, profile, lambda name, _: {name, "profile"} & set(inspect.signature(factory).parameters))
+    warn_of_calibration(text, profile, lambda name, _: name in taken or "profile" in taken)
     with suppress(TypeError):  # of what cannot be referred to weakly
         _MADE[id(made)] = made
     return made  # type: ignore[no-any-return]
@@ -116,9 +118,8 @@ def warn_of_calibration(who: str, profile: DeviceProfile | None, takes: Callable
     lost = [f"{name} = {value:g}" for name, value in stated.items() if value is not None and not takes(name, value)]
     if lost:
         cure = "give a driver these numbers itself, and keep them as its attributes, or a parameter of that name"
-        warnings.warn(
-            f"calibration: {', '.join(lost)}: {who} does not take it, so it has no effect: {cure}", stacklevel=4
-        )
+        problem = f"{', '.join(lost)}: {who} does not take it, so it has no effect: {cure}"
+        warnings.warn(f"calibration: {problem}", stacklevel=4)
 
 
 @contextmanager
@@ -154,16 +155,6 @@ def imported(text: str, module: str, called: str) -> Any:
     if not callable(factory):
         raise ValueError(f"driver = {text!r}: {called} is a {type(factory).__name__}: must be a class or a function")
     return factory
-
-
-def _calibration(factory: Callable[..., Any], profile: DeviceProfile | None) -> dict[str, Any]:
-    """Entries of the calibration, and the profile, that a driver's parameters name; what was not measured is none."""
-    if profile is None:
-        return {}
-    values = {each.name: getattr(profile.calibration, each.name) for each in fields(profile.calibration)}
-    values["profile"] = profile
-    known = inspect.signature(factory).parameters
-    return {name: value for name, value in values.items() if name in known and value is not None}
 
 
 def _cure(error: BaseException) -> str:

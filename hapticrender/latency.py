@@ -93,26 +93,22 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
 
     Raises
     ------
-    ValueError
-        An argument is out of its bound, or the driver senses nothing.
-    DriverError
-        Nothing of what was played is sensed, samples were lost in most of the runs, or the runs disagree.
+    ValueError, DriverError
+        An argument is out of its bound, or the driver senses nothing; nothing of what was played is sensed, samples
+        were lost in most of the runs, or the runs disagree.
     """
     if runs < 1 or not 0 < amplitude < np.inf:
         raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
-    rng, trips, tries = np.random.default_rng(0), [], 0
-    for opened in _opened(driver):
-        tries += 1
-        trip = _trip(opened, amplitude, rng)
-        if trip is not None:
+    rng, trips, name = np.random.default_rng(0), list[Trip](), f"{driver}: latency"
+    for tries, opened in enumerate(_opened(driver), 1):
+        if trip := _trip(opened, amplitude, rng):
             trips.append(trip)
-        if len(trips) == runs or tries == TRIES * runs:
+        if len(trips) == runs:
             break
-    name = f"{driver}: latency"
-    if len(trips) < runs:
-        raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
+        if tries == TRIES * runs:
+            raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
     found = Latency(tuple(trips), float(opened.rate), int(opened.block), int(getattr(opened, "queued", 0)))
     weakest = min(trip.correlation for trip in trips)
     if weakest < LEAST_CORRELATION:
