@@ -242,7 +242,9 @@ class Validated:
         about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
         text = inspect.cleandoc(cls.__doc__ or "")
         if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):
-            heads = (f"{name} : {cls.__annotations__[name]}, {each.get('unit', '')}" for name, each in about.items())
+            kinds = (hint if isinstance(hint, str) else inspect.formatannotation(hint) for hint in hints.values())
+            kind = {name: re.sub(r"\b[a-z][\w.]*\.(?=\w)", "", each) for name, each in zip(hints, kinds, strict=True)}
+            heads = (f"{name} : {kind[name]}, {each.get('unit', '')}" for name, each in about.items())
             rows = [
                 f"{head.rstrip(', ')}\n    {each['about']}." for head, each in zip(heads, about.values(), strict=True)
             ]
@@ -254,7 +256,7 @@ class Validated:
             check, value = each.metadata.get("check"), getattr(self, each.name)
             if check is None or (value is None and each.default is None):
                 continue
-            check = integer if check is number and each.type in (int, "int", "int | None") else check
+            check = integer if check is number and "int" in str(each.type) else check
             keep(self, **{each.name: check(each.name, value, **each.metadata["bounds"])})
 
     @classmethod

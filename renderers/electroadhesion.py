@@ -6,8 +6,6 @@ or the carrier itself; it senses friction (N) on a tribometer, the attraction (N
 voltage and current, or nothing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 

@@ -4,8 +4,6 @@ A texture is a displacement of the skin (m); friction moves it with a force (N).
 F = V/(v/F), with v/F = 0.64 m/(N s) over 20-400 Hz [Grigorii et al. 2021], or the finger's own admittance.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any

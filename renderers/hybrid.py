@@ -9,8 +9,6 @@ shares of both sum to one at every frequency: the screen's is
 each bank takes its share while the frequency goes up and down, by the fades that end its range.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

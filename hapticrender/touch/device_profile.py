@@ -1,7 +1,5 @@
 """The profile of a device: what is known of one, by which measurement, and what it must never be driven beyond."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields

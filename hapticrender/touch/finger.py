@@ -1,11 +1,9 @@
 """The finger: trajectory, normal load, touches and mechanics."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -87,19 +85,19 @@ class Finger(Validated):
         checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load))
 
     @classmethod
-    def absent(cls) -> Finger:
+    def absent(cls) -> Self:
         """No finger: never touches."""
         return cls(Nowhere())
 
     @classmethod
-    def still(cls, position: float = 0.0, normal_load: Any = 0.4, **touch: Any) -> Finger:
+    def still(cls, position: float = 0.0, normal_load: Any = 0.4, **touch: Any) -> Self:
         """Return a finger that rests at `position` (m); `touch` holds touches, mechanics, load_scaling."""
         return cls(Still(position), normal_load, **touch)
 
     @classmethod
     def sliding(
         cls, speed: float, normal_load: Any = 0.4, span: float = 0.05, centre: float = 0.0, **touch: Any
-    ) -> Finger:
+    ) -> Self:
         """Return a finger that moves at `speed` (m/s), back and forth over `span` (m) around `centre` (m)."""
         return cls(TriangleMotion(speed, span, centre), normal_load, **touch)
 
@@ -112,21 +110,19 @@ class Finger(Validated):
         normal_load: Any = 0.4,
         centre: float = 0.0,
         **touch: Any,
-    ) -> Finger:
+    ) -> Self:
         """Return a finger that swipes sinusoidally, by peak `speed` (m/s) or by `stroke` (m)."""
         return cls(SineMotion(frequency, speed, stroke, centre), normal_load, **touch)
 
     @classmethod
     def sampled(
         cls, positions: Any, rate: float | None = None, times: Any = None, normal_load: Any = 0.4, **touch: Any
-    ) -> Finger:
+    ) -> Self:
         """Return a finger at given `positions` (m), at `rate` (Hz) or at `times` (s)."""
         return cls(Sampled(positions, rate, times), normal_load, **touch)
 
     @classmethod
-    def recorded(
-        cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any
-    ) -> Finger:
+    def recorded(cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any) -> Self:
         """Return the finger of a tribometer recording, from `start` (s) on, with its own load unless given."""
         return cls(RecordedMotion(os.fspath(file), start), normal_load, **touch)
 

@@ -1,7 +1,5 @@
 """Gratings: textures of a few partials, in time or in space."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar

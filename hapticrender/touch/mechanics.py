@@ -1,7 +1,5 @@
 """Mechanical impedance of a fingertip on a moving surface, and how its skin and phalanx share the motion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Finger trajectories: position as a pure function of time."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar

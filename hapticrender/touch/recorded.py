@@ -1,7 +1,5 @@
 """Recorded textures: a sound file, the lateral force of a real swipe, and a synthetic one that needs no file."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache

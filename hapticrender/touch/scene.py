@@ -1,7 +1,5 @@
 """The scene: texture, finger, device and duration; the unit of reproducibility."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -199,7 +197,7 @@ class Scene(Validated):
         return TouchPanel.read("touch_panel", self.touch_panel) if self.touch_panel else None
 
     @classmethod
-    def from_toml(cls, path: str | os.PathLike[str]) -> Scene:
+    def from_toml(cls, path: str | os.PathLike[str]) -> "Scene":
         """Read a scene file; files that it names are taken from its own folder, and read as well.
 
         A `SceneError` states in one line file, key, value, bound and unit.
@@ -211,7 +209,7 @@ class Scene(Validated):
     @classmethod
     def from_toml_text(
         cls, text: str, where: str = "scene", *, folder: str | os.PathLike[str] = "", name: str = "scene"
-    ) -> Scene:
+    ) -> "Scene":
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         with naming(where):
             scene = _read_scene(toml.loads(text), Path(folder), name)

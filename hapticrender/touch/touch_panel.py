@@ -1,7 +1,5 @@
 """A touch panel as it is: late, irregular, rounded samples of a finger's position, and what is made of them."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
