@@ -79,9 +79,8 @@ class Bands:
             column: Array = np.asarray(getattr(self, name), kind)
             object.__setattr__(self, name, column)
             if column.ndim != 1 or column.shape != self.frequency.shape:
-                raise ValueError(
-                    f"{name} has shape {column.shape}: must be one number a band, as many as frequency has"
-                )
+                bound = "must be one number a band, as many as frequency has"
+                raise ValueError(f"{name} has shape {column.shape}: {bound}")
             signed = name in ("phase", "envelope")
             for bad in np.flatnonzero(~(np.isfinite(column) & (signed | (column.real >= 0.0))))[:1]:
                 bound = "finite" if signed else "finite and >= 0"

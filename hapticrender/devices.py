@@ -1,7 +1,5 @@
 """What is installed and what is there: kinds of device, drivers, extras; and drivers chosen by a text."""
 
-from __future__ import annotations
-
 import errno
 import inspect
 import warnings
@@ -44,7 +42,7 @@ def registered(group: str, name: str) -> Any:
         raise HapticError(reason) from error
 
 
-def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool = False) -> Driver | None:
+def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bool = False) -> "Driver | None":
     """Make the driver that a text names, for a ``with`` statement to open; None for the simulated device.
 
     Parameters
@@ -99,7 +97,7 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
     return made  # type: ignore[no-any-return]
 
 
-def check_calibration(driver: Driver, profile: DeviceProfile) -> None:
+def check_calibration(driver: "Driver", profile: "DeviceProfile") -> None:
     """Warn where a profile states what an object of the caller's does not have: it gets nothing of a profile.
 
     An attribute of the entry's name and value says that it was taken; a `delay` may be longer.
@@ -112,7 +110,7 @@ def check_calibration(driver: Driver, profile: DeviceProfile) -> None:
         warn_of_calibration(type(driver).__name__, profile, takes)
 
 
-def warn_of_calibration(who: str, profile: DeviceProfile | None, takes: Callable[[str, float], Any]) -> None:
+def warn_of_calibration(who: str, profile: "DeviceProfile | None", takes: Callable[[str, float], Any]) -> None:
     """Warn of the entries of a calibration that a driver does not take; `gain_uncertainty` is the recording's."""
     stated = {name: getattr(profile and profile.calibration, name, None) for name in SCALES}
     lost = [f"{name} = {value:g}" for name, value in stated.items() if value is not None and not takes(name, value)]

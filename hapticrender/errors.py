@@ -4,8 +4,6 @@ Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add
 what a caller may want to catch by kind.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -83,7 +81,7 @@ class PlateMismatch(UserWarning):
     Raised as an error, where warnings are, it holds the `recording` of the run, if there was one.
     """
 
-    recording: Recording | None = None
+    recording: "Recording | None" = None
 
 
 # what a wrong scene or file may raise

@@ -3,19 +3,15 @@
 A plate moves the skin with it, V = j w X; friction moves it by V = (v/F) F, with v/F as the scene has it.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import amplitude_error
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.perception import VELOCITY_PER_FORCE, sensation_level
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
 
 
 class SkinBand(NamedTuple):

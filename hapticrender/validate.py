@@ -233,18 +233,16 @@ def _problem(error: BaseException) -> str:
 
 def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> tuple[dict[str, Any], tuple[str, ...]]:
     """Run a rendering, whatever its length, and judge it; only what does not pass stays in `folder`.  And warnings."""
-    if folder is None:
-        with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(scratch):
-            recording = outputs.run_to_end(rendering, journal=Path(scratch) / outputs.JOURNAL, progress=tick)
-            return recording.summary(), recording.warnings
-    outputs.refuse_to_overwrite(folder)
-    with outputs.naming_full(folder):
-        recording = outputs.run_to_end(rendering, journal=outputs.begin_outputs(folder, rendering.scene), progress=tick)
+    if folder is not None:
+        outputs.refuse_to_overwrite(folder)
+    with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(place := folder or Path(scratch)):
+        journal = outputs.begin_outputs(place, rendering.scene)
+        recording = outputs.run_to_end(rendering, journal=journal, progress=tick)
         summary, warned = recording.summary(), recording.warnings
-        if not summary["passed"]:
+        if folder is not None and not summary["passed"]:
             return dict(outputs.write_outputs(folder, recording).summary), warned
-    del recording  # closes its journal
-    outputs.remove_outputs(folder)
+        del recording  # closes its journal
+        outputs.remove_outputs(place)
     return summary, warned
 
 

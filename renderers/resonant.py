@@ -54,9 +54,8 @@ class ResonantDriver(WrappedDriver):
         many = _multiple(driver, parameters)
         super().__init__(driver)
         self.drive_channels, self.finger = 1, finger
-        self.parameters = replace(
-            parameters, level="carrier", oversampling=many, mode=replace(parameters.mode, delay=driver.delay)
-        )
+        mode = replace(parameters.mode, delay=driver.delay)
+        self.parameters = replace(parameters, level="carrier", oversampling=many, mode=mode)
         self.rate = float(parameters.rate)
         self.block = max(driver.block // many, 1)
         self.delay = self.block

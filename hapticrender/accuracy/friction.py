@@ -71,9 +71,8 @@ def line(signal: Array, rate: float, frequency: float, start: float) -> float:
 def tones(device: str, method: str) -> dict[str, float]:
     """8 tones, 20 to 400 Hz, under three fingers: worst rms error."""
     played = product((20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0), FINGERS)
-    return {
-        "error": max(worst(play(device, method, Grating(frequency=f, velocity=VELOCITY), who)) for f, who in played)
-    }
+    errors = (worst(play(device, method, Grating(frequency=f, velocity=VELOCITY), who)) for f, who in played)
+    return {"error": max(errors)}
 
 
 def comb(device: str, method: str) -> dict[str, float]:

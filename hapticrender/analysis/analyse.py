@@ -1,9 +1,9 @@
 """The finger out of a recording: contact, then the plate where nothing touches it, then the finger on that plate."""
 
-import itertools
 import os
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -101,9 +101,7 @@ def analyse_finger(
     return FingerRecord(
         **vars(touch),
         name=recording.header.name,
-        segments=tuple(
-            Segment(int(touch.contact[i]), i / rate, j / rate) for i, j in itertools.pairwise(edges.tolist())
-        ),
+        segments=tuple(Segment(int(touch.contact[i]), i / rate, j / rate) for i, j in pairwise(edges.tolist())),
         plate=course.track(len(drive) / rate),
         impedance=impedance,
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
@@ -130,8 +128,8 @@ def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str
         profile = recording.scene.device_profile
     accepted = "a DeviceProfile, PlateParameters, the path of a profile, or None for that of the recording"
     require(isinstance(profile, DeviceProfile), "profile", profile, accepted, TypeError)
-    if profile.kind != "vt-plate":
-        raise ValueError(f"profile.kind = {profile.kind!r}: must be vt-plate, a plate with sensors of displacement")
+    plate = "vt-plate, a plate with sensors of displacement"
+    require(profile.kind == "vt-plate", "profile.kind", profile.kind, plate)
     known = {} if recording.header.delay is None else {"delay": recording.header.delay}
     stated = {**known, **profile.device} if given else {**profile.device, **known}
     return Course.of(PlateParameters.with_overrides(stated), profile.uncertainty, duration)
@@ -148,11 +146,9 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
     block = plate.delay - late
-    cure = "delay, from a sensed sample to the drive computed from it, in [device] of the profile"
+    cure = "state delay, from a sensed sample to the drive computed from it, in [device] of the profile"
     if not (isinstance(block, int | np.integer) and 1 <= block <= plate.delay):
-        raise ValueError(
-            f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}: state {cure}"
-        )
+        raise ValueError(f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}: {cure}")
     if not np.isfinite(recording.sensed).any(axis=0).all():
         raise ValueError(f"{header.name}: a sensor is finite nowhere: must be displacement in m")
 
@@ -178,14 +174,12 @@ class _Signals:
         padded = (np.concatenate([each, np.repeat(each[-1:], wide.delay, axis=0)]) for each in (drive, sensed))
         x = wide.update(*padded)
         self.columns = np.hstack([x.displacement, x.velocity, x.acceleration, x.force])[wide.delay :]
-        self.sensor_noise = at_least(sensor_noise(sensed), plate)
-        self.noise = wide.coordinate_noise(self.sensor_noise)
+        self.white = at_least(sensor_noise(sensed), plate)
+        self.noise = wide.coordinate_noise(self.white)
 
     def track(self, course: Course, rest: Rest | None) -> tuple[Touch, FingerTracker]:
         """Track the whole recording, symmetric in time, a second at a time."""
-        tracker = FingerTracker(
-            course, rate=self.rate, late=self.late, noise=self.sensor_noise, lookahead=1.0, rest=rest
-        )
+        tracker = FingerTracker(course, rate=self.rate, late=self.late, noise=self.white, lookahead=1.0, rest=rest)
         step = round(BLOCK * self.rate)
         starts = range(0, len(self.drive), step)
         parts = [tracker.update(self.drive[i : i + step], self.sensed[i : i + step]) for i in starts]
@@ -198,9 +192,8 @@ class _Signals:
         """
         from scipy.ndimage import gaussian_filter1d
 
-        force = Signals.of(self.columns).residual(
-            course.at(np.arange(len(self.columns)) / self.rate), course.plate.half_spacing
-        )
+        theta = course.at(np.arange(len(self.columns)) / self.rate)
+        force = Signals.of(self.columns).residual(theta, course.plate.half_spacing)
         return np.asarray(gaussian_filter1d(force[:, 0], spread_of(SLOWEST / 3) * self.rate, mode="nearest"))
 
     def unloaded(self, free: Array, load: Array, frequency: Array, length: int, quiet: float) -> Lines:

@@ -76,9 +76,8 @@ def _power(samples: Samples) -> tuple[float, ...]:
     def power(at: Array, magnitude: float, exponent: float) -> Array:
         return magnitude * np.exp(np.clip(exponent * at, -50, 50))
 
-    (magnitude, exponent), covariance = curve_fit(
-        power, logs - middle, size, p0=(mean, 0.3), sigma=sigma, absolute_sigma=True
-    )
+    found = curve_fit(power, logs - middle, size, p0=(mean, 0.3), sigma=sigma, absolute_sigma=True)
+    (magnitude, exponent), covariance = found
     chi_square = float(np.sum(((power(logs - middle, magnitude, exponent) - size) / sigma) ** 2))
     error = sqrt(covariance[1, 1] * max(1.0, chi_square / (count - 2)))
     together = float(np.corrcoef(samples.load, size)[0, 1] ** 2) if np.ptp(size) else 0.0

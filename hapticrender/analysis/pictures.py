@@ -42,9 +42,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     fits = fit_all(records)
-    drawn: dict[str, Callable[[Path], None]] = {
-        f"time-{i + 1}.png": partial(draw_time, each) for i, each in enumerate(records)
-    }
+    drawn: dict[str, Any] = {f"time-{i}.png": partial(draw_time, each) for i, each in enumerate(records, 1)}
     load = samples_of(records).load
     if load.size and np.ptp(np.log(load)) >= APART:  # how the impedance grows with the load is in the data
         drawn["load.png"] = partial(draw_load, records)

@@ -16,10 +16,8 @@ follows from the rate of false alarms.  Two fingers alike, at places that the pl
 leave what one finger between them would.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,9 +25,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import derivative_filters
 from hapticrender.control.inverse_records import HEAVE, LOAD, TAPS
 from hapticrender.protocols import Array, Flag
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
+from hapticrender.recordings.recording import Recording
 
 WINDOW = 0.25  # s
 BAND = (20.0, 400.0)  # Hz

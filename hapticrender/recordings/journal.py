@@ -4,8 +4,6 @@
 after the process that wrote it was killed (libsndfile up to 1024 columns, 507 bands on a plate).
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os
@@ -16,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 
@@ -115,7 +113,7 @@ class Header(Validated):
         require(fits, "sensed_noise", self.sensed_noise, "one number, or one a place")
 
     @classmethod
-    def of(cls, scene: Scene, **rest: Any) -> Header:
+    def of(cls, scene: "Scene", **rest: Any) -> Self:
         """Take name, device, duration, tolerance and settling time from a scene, but for what `rest` states."""
         own = {name: getattr(scene, name) for name in ("name", "device", "duration", "tolerance", "settle")}
         return cls(scene=scene.to_toml(), **own | rest)
@@ -168,7 +166,7 @@ class Header(Validated):
         return json.dumps({"format": FORMAT, "version": VERSION, **values, "bands": bands, "channels": channels})
 
     @classmethod
-    def from_json(cls, note: str, where: str = "header") -> Header:
+    def from_json(cls, note: str, where: str = "header") -> Self:
         """Read what `to_json` wrote, checking every field; `where` names the file in an error."""
         try:
             values = json.loads(note)

@@ -222,9 +222,8 @@ class Recording:
         return len(self.frames)
 
     def __repr__(self) -> str:
-        return (
-            f"<Recording of {self.header.name!r} by {self.method!r}: {len(self) / self.rate:.3g} s at {self.rate} Hz>"
-        )
+        length = f"{len(self) / self.rate:.3g} s at {self.rate} Hz"
+        return f"<Recording of {self.header.name!r} by {self.method!r}: {length}>"
 
     @cached_property
     def scene(self) -> Scene:
@@ -242,9 +241,7 @@ class Recording:
     motion: Array = _signal("motion", "Motion at the evaluation points (unit, shape (n, places)).")
     position: Array = _signal("position", "Finger from the middle of the surface (m, shape (n,)), NaN while lifted.")
     normal_load: Array = _signal("normal_load", "Load of the finger (N, shape (n,)).")
-    reference: Array = _signal(
-        "reference", "Texture as the scene specifies it (unit, shape (n,)), unscaled and in full."
-    )
+    reference: Array = _signal("reference", "Texture as the scene specifies it, unscaled (unit, shape (n,)).")
     target: Array = _signal("target", "Reference envelopes (unit, complex, shape (n, n_bands)).")
     flags: Array = _signal("flags", "Status words (int, shape (n,)), see ``protocols.Flag``.")
 

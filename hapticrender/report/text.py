@@ -1,7 +1,5 @@
 """Verdicts, scenes, summaries and progress as text for the command line, reports and pages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -109,14 +107,12 @@ def beside(summary: Mapping[str, Any]) -> str:
     found = summary["waveform"]
     if found["delay"] is None:
         return "no waveform"
-    stated = [
-        f"delay {quantity(found['delay'], 's')}, gain {found['gain']:.3f}, incoherent {percent(found['incoherent'])}"
-    ]
-    contacts = found["contacts"]
+    delay, incoherent, contacts = quantity(found["delay"], "s"), percent(found["incoherent"]), found["contacts"]
+    stated = f"delay {delay}, gain {found['gain']:.3f}, incoherent {incoherent}"
     if contacts["count"]:
         errors = " and ".join(percent(contacts[f"error_{span}_ms"]) for span in ("0_50", "50_200"))
-        stated.append(f"{contacts['count']} touches and lifts: error {errors} in 0-50 and 50-200 ms after them")
-    return "; ".join(stated)
+        stated += f"; {contacts['count']} touches and lifts: error {errors} in 0-50 and 50-200 ms after them"
+    return stated
 
 
 def conditions(summary: Mapping[str, Any]) -> str:
@@ -128,7 +124,7 @@ def conditions(summary: Mapping[str, Any]) -> str:
     )
 
 
-def describe(scene: Scene) -> str:
+def describe(scene: "Scene") -> str:
     """Describe a scene in a line: its texture, its finger, its length and its device."""
     texture, motion = (getattr(each, "kind", type(each).__name__) for each in (scene.texture, scene.finger.motion))
     sizes = ((getattr(scene.texture, key, None), unit) for key, unit in (("amplitude", "m"), ("frequency", "Hz")))

@@ -1,7 +1,5 @@
 """Textures made of textures: sums, multiples and playlists; and the chirp."""
 
-from __future__ import annotations
-
 import math
 import os
 from dataclasses import dataclass
@@ -29,18 +27,18 @@ Parts = tuple[tuple[Texture, float], ...]
 class Composable:
     """Base of the library's textures: ``a + b``, ``a - b``, ``0.5 * a`` and ``sum([a, b])`` are `Sum`s."""
 
-    def __add__(self, other: Any) -> Sum:
+    def __add__(self, other: Any) -> "Sum":
         return Sum((*_terms(self), *_terms(other))) if isinstance(other, Texture) else NotImplemented
 
-    def __mul__(self, gain: float) -> Sum:
+    def __mul__(self, gain: float) -> "Sum":
         return Sum(tuple((each, gain * own) for each, own in _terms(self)))
 
     __rmul__ = __mul__
 
-    def __neg__(self) -> Sum:
+    def __neg__(self) -> "Sum":
         return self * -1.0
 
-    def __sub__(self, other: Any) -> Sum:
+    def __sub__(self, other: Any) -> "Sum":
         return self + -Sum(_terms(other)) if isinstance(other, Texture) else NotImplemented
 
     def __radd__(self, other: Any) -> Any:  # the 0 that `sum` begins with

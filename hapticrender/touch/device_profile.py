@@ -24,13 +24,9 @@ class Limits(Validated):
     """
 
     peak_drive: float | None = parameter(None, about="drive unit: largest magnitude of each channel", above=0.0)
-    rms_drive: float | None = parameter(
-        None, about="drive unit: largest rms of each channel over about `rms_time`, by which a coil heats", above=0.0
-    )
+    rms_drive: float | None = parameter(None, about="drive unit: largest rms of a channel over `rms_time`", above=0.0)
     rms_time: float = parameter(10.0, "s", "time constant of that mean, of the coil's heat", least=0.1, most=1e4)
-    displacement: float | None = parameter(
-        None, "m", "largest magnitude that a sensor of displacement may show, static load included", above=0.0
-    )
+    displacement: float | None = parameter(None, "m", "largest magnitude sensed, static load included", above=0.0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,9 +77,8 @@ class Finger(Validated):
     load_scaling: bool = checked(checks.flag, False)
 
     def __post_init__(self) -> None:
-        checks.require(
-            isinstance(self.motion, Motion), "motion", self.motion, "a motion with position(time)", TypeError
-        )
+        known = isinstance(self.motion, Motion)
+        checks.require(known, "motion", self.motion, "a motion with position(time)", TypeError)
         checks.keep(self, normal_load=_read_load(self.normal_load, self.motion))
         super().__post_init__()
         checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load))

@@ -74,13 +74,9 @@ class Grating(Validated, Composable):
     harmonics: int = parameter(5, about="odd Fourier partials of a square or triangle", least=1, most=MOST_PARTIALS)
     partials: tuple[Partial, ...] | None = checked(_read_partials, None, about=PARTIALS)
     phase: float = parameter(0.0, "rad", "of the fundamental at t = 0, x = 0", least=-1e6, most=1e6)
-    velocity: float | None = parameter(
-        None, "m/s", "peak skin velocity, 2 pi f times the amplitude", least=1e-9, most=10
-    )
+    velocity: float | None = parameter(None, "m/s", "of the skin, 2 pi f times the amplitude", least=1e-9, most=10)
     level: float | None = parameter(None, "dB", "over the classic threshold, f 1 to 1000 Hz", least=-100, most=100)
-    speed: float | None = parameter(
-        None, "m/s", "of the finger for `velocity` or `level` in space", least=1e-6, most=10
-    )
+    speed: float | None = parameter(None, "m/s", "of the finger, for the two above in space", least=1e-6, most=10)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -47,11 +47,10 @@ class Custom(Validated):
     waveform = position = load = bands
 
 
-TEXTURES: dict[str, type[Any]] = {
-    kind.kind: kind for kind in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)
-}
-MOTIONS: dict[str, type[Any]] = {
-    kind.kind: kind for kind in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
+Kinds = dict[str, type[Any]]
+TEXTURES: Kinds = {one.kind: one for one in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)}
+MOTIONS: Kinds = {
+    one.kind: one for one in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
 }
 TABLES = {  # field of a scene: table of a file
     "profile": "device",
@@ -300,7 +299,7 @@ def _check_keys(table: dict[str, Any]) -> None:
     checks.check_names(table, ["name", "duration", "texture", "finger", *TABLES.values()])
 
 
-def _read_kind(table: Any, key: str, choice: str, kinds: dict[str, type[Any]], folder: Path, extra: Any = ()) -> Any:
+def _read_kind(table: Any, key: str, choice: str, kinds: Kinds, folder: Path, extra: Any = ()) -> Any:
     """Make the object that `table[choice]` names from the keys that are its fields; `extra` keys are left alone."""
     bound = f"a table with {choice} = one of {', '.join(kinds)}"
     checks.require(isinstance(table, dict), key, table, bound, TypeError)
