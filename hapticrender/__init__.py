@@ -6,8 +6,7 @@
 >>> f"{1e6 * recording.summary()['bands'][0]['target']:.1f} um"
 '10.0 um'
 
-The public names are loaded when they are first used, so that importing the
-package costs next to nothing.
+The public names are loaded when they are first used, so that importing the package costs next to nothing.
 """
 
 import typing as _typing

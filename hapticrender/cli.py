@@ -1,9 +1,8 @@
 """The command line.
 
-Arguments and scenes are checked before anything is written.  Exit status: 0
-done, 1 a scene misses its tolerance (``validate``), 2 bad input, a driver that
-failed or no permission to write, 130 interrupted; each error is one line, with
-its traceback where Python runs with ``-X dev``.
+Arguments and scenes are checked before anything is written.  Exit status: 0 done, 1 a scene misses its tolerance
+(``validate``), 2 bad input, a driver that failed or no permission to write, 130 interrupted; each error is one line,
+with its traceback where Python runs with ``-X dev``.
 """
 
 import argparse

@@ -1,7 +1,6 @@
 """Every error that the library raises itself.
 
-Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add
-what a caller may want to catch by kind.
+Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add what a caller may want to catch by kind.
 """
 
 import math

@@ -6,9 +6,8 @@ Data flows one way round::
                              ^                        |
                              +----- sensed block -----+
 
-Everything is SI.  Time belongs to the loop: the core counts samples, only
-drivers know seconds.  Arrays are float64, C-contiguous, with time first and
-the band (or channel) last.
+Everything is SI.  Time belongs to the loop: the core counts samples, only drivers know seconds.  Arrays are float64,
+C-contiguous, with time first and the band (or channel) last.
 """
 
 from __future__ import annotations

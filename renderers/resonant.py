@@ -31,8 +31,7 @@ class ResonantDriver(WrappedDriver):
     (N) goes in, and what follows from the sensed amplitude comes out, at the lower rate.  The device's block is a whole
     multiple of that multiple, or divides it.  `finger` says where the finger is, and how hard it presses where the
     device does not measure it; `nominal` is the load (N) and speed (m/s) for which the amplitude is held while no
-    finger is there.  `demand` is what the scene needs of the mode (m, V); its drive is
-    supervised by it.
+    finger is there.  `demand` is what the scene needs of the mode (m, V); its drive is supervised by it.
 
     Notes
     -----

@@ -71,10 +71,9 @@ class InseparableTexture(ValueError):
 class SeparatedTexture:
     """A texture, parted into functions of time (`timed`: any part) and of position (`spatial`).
 
-    It is in time, along the surface (see `is_spatial`), or a `Sum` of both; `waveform_of` a part is its
-    waveform in the device's quantity, by default its own.  An `InseparableTexture` where its parts are in time and
-    along the surface, and it is no sum; or a function of position is not the same at all `READINGS`, or one of time not
-    at all `PLACES`.
+    It is in time, along the surface (see `is_spatial`), or a `Sum` of both; `waveform_of` a part is its waveform in the
+    device's quantity, by default its own.  An `InseparableTexture` where its parts are in time and along the surface,
+    and it is no sum; or a function of position is not the same at all `READINGS`, or one of time not at all `PLACES`.
     """
 
     def __init__(self, texture: Texture, waveform_of: Any = None) -> None:

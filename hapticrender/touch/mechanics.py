@@ -36,9 +36,8 @@ class FingerMechanics(Validated):
 
     Notes
     -----
-    The equation of the phalanx is ``0 = m_p x_p'' + b_p x_p' + k_p x_p + b_s
-    (x_p' - x_s') + k_s (x_p - x_s)``; the paper prints b_p x_s' in it, which
-    is off by up to 35 % (72 Hz, light finger).
+    The equation of the phalanx is ``0 = m_p x_p'' + b_p x_p' + k_p x_p + b_s (x_p' - x_s') + k_s (x_p - x_s)``; the
+    paper prints b_p x_s' in it, which is off by up to 35 % (72 Hz, light finger).
 
     References
     ----------
