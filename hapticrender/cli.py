@@ -28,6 +28,117 @@ start here:
 
 `hapticrender VERB --help` describes each verb.  An error is one line; its traceback: python -X dev -m hapticrender VERB
 """
+_STATUS = """Exit status: 0 no scene misses its tolerance, 1 one does, 2 one cannot be rendered, or a report is not
+written.  A scene that cannot be judged is counted, skipped in JUnit, and no pass in JSON."""
+_SUITE = """instead of scenes: accuracy, all targets of the library, or the cases with SCENE in their names; --driver
+module:callable plays those of plates on yours (hapticrender.accuracy.plate.Bench)"""
+_FREE_START = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
+_EXPECTED = "scene whose [device] is the expected one, and [simulation] the simulated one (default: the paper's plate)"
+_FULL_SCALE = "of full scale on a sound card, in A or V elsewhere"
+
+
+def _option(names: str, value: str, text: str, kind: Any = str, **settings: Any) -> tuple[list[str], dict[str, Any]]:
+    """An option by its names, or an argument, and its settings; it is a mark where its `value` has no name."""
+    own = {"metavar": value, "type": kind} if value else {"action": "store_true"}
+    return names.split(), {"help": text, **own, **settings}
+
+
+def _path(text: str) -> Path:
+    """Read the name of a file or folder; an empty one would silently mean the folder that one stands in."""
+    if not text:
+        raise argparse.ArgumentTypeError("'': must be a name (a dot is the folder that you are in)")
+    return Path(text)
+
+
+def _whole(least: int, most: int) -> Any:
+    """Reader of a whole number from `least` to `most`."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) <= 18 and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from {least} to {most}")
+        return int(text)
+
+    return read
+
+
+_METHODS = f"one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
+_METHOD = _option("--method", "NAME", f"control method: {_METHODS}")
+_KINDS = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
+_DRIVER = _option("--driver", "NAME[:ARG]", _KINDS, default="simulated")
+_SEED = _option("--seed", "N", "seed of the noise (default: the scene's)", _whole(0, 10**18 - 1))
+_SCENE = _option("scene", "SCENE", "a TOML file, or the name of a built-in scene")
+_RECORDING = _option("path", "PATH", "a recording, or the folder of a rendered scene", _path)
+_FOLDER, _DEMO = "folder to write into; made if it is not there", Path("out/demo")
+_FORCE = _option("--force", "", "overwrite files that are not from an earlier run")
+_OUT = _option("--out -o", "DIR", _FOLDER, _path, required=True)
+_VERBS: dict[str, list[Any]] = {  # line of help and options of each; `hapticrender.verbs` has a function of each name
+    "demo": [
+        "render the built-in scenes and make a page of sounds, pictures and figures",
+        _option("--out -o", "DIR", f"{_FOLDER} (default: {_DEMO})", _path, default=_DEMO),
+        *(_FORCE, _METHOD, _SEED),
+    ],
+    "render": [
+        "render one scene into a folder",
+        *(_SCENE, _OUT, _FORCE, _METHOD, _DRIVER, _SEED),
+        _option("--least-model", "", "leave out of the model what a scene does not need"),
+        _option("--verbose -v", "", "print all figures and notes on the controller"),
+    ],
+    "play": [
+        "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags",
+        _SCENE,
+        _option("--seconds", "S", "how long (default: the scene's duration)", float),
+        _option("--out -o", "DIR", _FOLDER, _path),
+        *(_FORCE, _METHOD, _DRIVER, _SEED),
+    ],
+    "validate": [
+        "render scenes and exit 1 when one misses its tolerance",
+        _option("scenes", "SCENE", "TOML files or built-in names (default: all)", nargs="*"),
+        _option("--suite", "NAME", _SUITE, choices=["accuracy"]),
+        _option("--json", "FILE", "write all figures as JSON; its folder is made", _path),
+        _option("--junit", "FILE", "write the JUnit XML that CI systems read; its folder is made", _path),
+        _option("--out -o", "DIR", "folder for the files of each scene that does not pass", _path),
+        _option("--jobs -j", "N", "processes (default: 1)", _whole(1, 999), default=1),
+        _option("--strict", "", "exit 1 also where a scene is not judged"),
+        *(_METHOD, _DRIVER, _SEED),
+    ],
+    "show": ["print the figures of a recording, finished or cut off by a crash", _RECORDING],
+    "finger": [
+        "measure the finger in a recording of a plate: load, position, contact, impedance",
+        _RECORDING,
+        _option("--profile", "FILE", "profile (TOML) of the plate (default: that of the recording's scene)", _path),
+        _option("--block", "N", "samples of the driver's block (default: as recorded, or 1)", _whole(1, 99999)),
+        _option("--free-start", "", _FREE_START),
+        *(_OUT, _FORCE),
+    ],
+    "identify": [
+        "identify a plate or an ultrasonic surface without a finger, or a screen",
+        _option("--scene", "SCENE", _EXPECTED),
+        _option("--amplitude", "M", "of a glass end (default: 100e-6)", float, default=100e-6),
+        _option("--seconds", "S", "length of the record (default: 1)", float, default=1.0),
+        _option("--out -o", "FILE", "write the result as a profile (TOML), for device = FILE in a scene", _path),
+        _option("--name", "TEXT", "which device it is (default: the file's name)"),
+        _option("--by", "TEXT", "who measures it", default=""),
+        *(_DRIVER, _SEED),
+    ],
+    "latency": [
+        "measure the delay of a loop by a cable from a driver's first output to its first input",
+        _option("--driver", "NAME[:ARG]", "driver of the device, such as audio:0", required=True),
+        _option("--runs", "N", "runs, which must agree (default: 5)", _whole(1, 999), default=5),
+        _option("--amplitude", "A", f"of the noise, {_FULL_SCALE} (default: 0.1)", float, default=0.1),
+        _option("--out -o", "FILE", "profile (TOML) whose [calibration] gets the delay; made if not there", _path),
+    ],
+    "export": [
+        "write a scene's controller as C sources for a microcontroller",
+        _SCENE,
+        _option("--bands", "N", "most on the board (default: 8, or the scene's number)", _whole(1, 64), default=0),
+        *(_OUT, _FORCE),
+    ],
+    "scenes": [
+        "list the built-in scenes, or print one as TOML",
+        _option("scene", "NAME", "the scene to print", nargs="?"),
+    ],
+    "devices": ["list kinds of device, drivers, and the cards and ports that are there"],
+}
 
 
 class _Parser(argparse.ArgumentParser):
@@ -93,155 +204,13 @@ def _line(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="hapticrender",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    style = argparse.RawDescriptionHelpFormatter
+    parser = _Parser(prog="hapticrender", description=_DESCRIPTION, epilog=_EXAMPLES, formatter_class=style)
     parser.add_argument("--version", action="version", version=f"hapticrender {__version__}")
     choices = parser.add_subparsers(title="verbs", metavar="VERB", dest="verb")
-    for add in (_add_players, _add_checks, _add_measurements, _add_lists):
-        add(choices)
+    for name, (text, *options) in _VERBS.items():
+        epilog = _STATUS if name == "validate" else None
+        verb = choices.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".", epilog=epilog)
+        for names, settings in options:
+            verb.add_argument(*names, **settings)
     return parser
-
-
-def _add_players(choices: Any) -> None:
-    """Add the verbs that play scenes."""
-    text = "render the built-in scenes and make a page of sounds, pictures and figures"
-    demo = _add_verb(choices, "demo", text)
-    _add_out(demo, default=Path("out/demo"))
-    _add_run(demo, driver=False)
-
-    render = _add_verb(choices, "render", "render one scene into a folder")
-    _add_scene(render)
-    _add_out(render, required=True)
-    _add_run(render)
-    render.add_argument("--least-model", action="store_true", help="leave out of the model what a scene does not need")
-    render.add_argument("--verbose", "-v", action="store_true", help="print all figures and notes on the controller")
-
-    text = "play one scene live until Ctrl-C or its end: a line a band, with target, achieved and flags"
-    play = _add_verb(choices, "play", text)
-    _add_scene(play)
-    play.add_argument("--seconds", metavar="S", type=float, help="how long (default: the scene's duration)")
-    _add_out(play)
-    _add_run(play)
-
-
-def _add_checks(choices: Any) -> None:
-    """Add the verbs that judge."""
-    validate = _add_verb(choices, "validate", "render scenes and exit 1 when one misses its tolerance")
-    validate.epilog = (
-        "Exit status: 0 no scene misses its tolerance, 1 one does, 2 one cannot be rendered, or a report not written.  "
-        "A scene that cannot be judged is counted, skipped in JUnit, and no pass in JSON."
-    )
-    validate.add_argument("scenes", metavar="SCENE", nargs="*", help="TOML files or built-in names (default: all)")
-    text = "instead of scenes: accuracy, all targets of the library, or the cases with SCENE in their names; "
-    text += "--driver module:callable plays those of plates on yours (hapticrender.accuracy.plate.Bench)"
-    validate.add_argument("--suite", metavar="NAME", choices=["accuracy"], help=text)
-    validate.add_argument("--json", metavar="FILE", type=_path, help="write all figures as JSON; its folder is made")
-    text = "write the JUnit XML that CI systems read; its folder is made"
-    validate.add_argument("--junit", metavar="FILE", type=_path, help=text)
-    text = "folder for the files of each scene that does not pass"
-    validate.add_argument("--out", "-o", metavar="DIR", type=_path, help=text)
-    validate.add_argument("--jobs", "-j", metavar="N", type=_whole(1, 999), default=1, help="processes (default: 1)")
-    validate.add_argument("--strict", action="store_true", help="exit 1 also where a scene is not judged")
-    _add_run(validate)
-
-    show = _add_verb(choices, "show", "print the figures of a recording, finished or cut off by a crash")
-    show.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
-
-
-def _add_measurements(choices: Any) -> None:
-    """Add the verbs that measure a device, or the finger on it, and the one that exports a controller."""
-    text = "measure the finger in a recording of a plate: load, position, contact, impedance"
-    finger = _add_verb(choices, "finger", text)
-    finger.add_argument("path", metavar="PATH", type=_path, help="a recording, or the folder of a rendered scene")
-    text = "profile (TOML) of the plate, as identify writes it (default: that of the scene of the recording)"
-    finger.add_argument("--profile", metavar="FILE", type=_path, help=text)
-    text = "samples of a block of the driver that recorded (default: as the recording says, or 1)"
-    finger.add_argument("--block", metavar="N", type=_whole(1, 99999), help=text)
-    text = "nothing touches in the first 0.5 s: take the sensors' zero from there (default: they read zero at rest)"
-    finger.add_argument("--free-start", action="store_true", help=text)
-    _add_out(finger, required=True)
-
-    text = "identify a plate or an ultrasonic surface without a finger, or a screen"
-    identify = _add_verb(choices, "identify", text)
-    text = "scene whose [device] is the expected one, and [simulation] the simulated one (default: the paper's plate)"
-    identify.add_argument("--scene", metavar="SCENE", help=text)
-    text = "of a glass end (default: 100e-6)"
-    identify.add_argument("--amplitude", metavar="M", type=float, default=100e-6, help=text)
-    identify.add_argument("--seconds", metavar="S", type=float, default=1.0, help="length of the record (default: 1)")
-    text = "write the result as a profile (TOML), which a scene takes by device = FILE"
-    identify.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
-    identify.add_argument("--name", metavar="TEXT", help="which device it is (default: the file's name)")
-    identify.add_argument("--by", metavar="TEXT", default="", help="who measures it")
-    _add_run(identify, method=False)
-
-    text = "measure the delay of a loop by a cable from a driver's first output to its first input"
-    latency = _add_verb(choices, "latency", text)
-    latency.add_argument("--driver", metavar="NAME[:ARG]", required=True, help="driver of the device, such as audio:0")
-    text = "runs, which must agree (default: 5)"
-    latency.add_argument("--runs", metavar="N", type=_whole(1, 999), default=5, help=text)
-    text = "of the noise, of full scale on a sound card, in A or V elsewhere (default: 0.1)"
-    latency.add_argument("--amplitude", metavar="A", type=float, default=0.1, help=text)
-    text = "profile (TOML) whose [calibration] gets the delay; made if it is not there"
-    latency.add_argument("--out", "-o", metavar="FILE", type=_path, help=text)
-
-    export = _add_verb(choices, "export", "write a scene's controller as C sources for a microcontroller")
-    _add_scene(export)
-    text = "most bands that the board can be set to (default: 8, or as many as the scene has)"
-    export.add_argument("--bands", metavar="N", type=_whole(1, 64), default=0, help=text)
-    _add_out(export, required=True)
-
-
-def _add_lists(choices: Any) -> None:
-    """Add the verbs that list."""
-    scenes = _add_verb(choices, "scenes", "list the built-in scenes, or print one as TOML")
-    scenes.add_argument("scene", metavar="NAME", nargs="?", help="the scene to print")
-    text = "list kinds of device, drivers, and the cards and ports that are there"
-    _add_verb(choices, "devices", text)
-
-
-def _add_verb(choices: Any, name: str, text: str) -> argparse.ArgumentParser:
-    """Add the verb that a function of this name in `hapticrender.verbs` runs."""
-    return choices.add_parser(name, help=text, description=text[:1].upper() + text[1:] + ".")  # type: ignore[no-any-return]
-
-
-def _add_scene(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("scene", metavar="SCENE", help="a TOML file, or the name of a built-in scene")
-
-
-def _add_out(verb: argparse.ArgumentParser, *, default: Path | None = None, required: bool = False) -> None:
-    text = "folder to write into; made if it is not there" + (f" (default: {default})" if default else "")
-    verb.add_argument("--out", "-o", metavar="DIR", type=_path, default=default, required=required, help=text)
-    verb.add_argument("--force", action="store_true", help="overwrite files that are not from an earlier run")
-
-
-def _add_run(verb: argparse.ArgumentParser, *, method: bool = True, driver: bool = True) -> None:
-    if method:
-        text = f"control method: one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
-        verb.add_argument("--method", metavar="NAME", help=text)
-    if driver:
-        text = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
-        verb.add_argument("--driver", metavar="NAME[:ARG]", default="simulated", help=text)
-    seed = _whole(0, 10**18 - 1)
-    verb.add_argument("--seed", metavar="N", type=seed, help="seed of the noise (default: the scene's)")
-
-
-def _path(text: str) -> Path:
-    """Read the name of a file or folder; an empty one would silently mean the folder that one stands in."""
-    if not text:
-        raise argparse.ArgumentTypeError("'': must be a name (a dot is the folder that you are in)")
-    return Path(text)
-
-
-def _whole(least: int, most: int) -> Any:
-    """Reader of a whole number from `least` to `most`."""
-
-    def read(text: str) -> int:
-        if not (text.isascii() and text.isdigit() and len(text) <= 18 and least <= int(text) <= most):
-            raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from {least} to {most}")
-        return int(text)
-
-    return read
