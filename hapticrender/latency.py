@@ -82,20 +82,11 @@ class Latency:
 def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> Latency:
     """Measure the delay of a driver's loop through a cable from its first output to its first input.
 
-    Parameters
-    ----------
-    driver : Driver or str
-        Any object with `play`, not opened yet, or a text as ``--driver`` takes it.  One with ``loop_back()`` makes a
-        new driver for every run.
-    runs : int, >= 1
-    amplitude : float, > 0
-        Of the burst, in the unit of the drive; of full scale for a sound card.
-
-    Raises
-    ------
-    ValueError, DriverError
-        An argument is out of its bound, or the driver senses nothing; nothing of what was played is sensed, samples
-        were lost in most of the runs, or the runs disagree.
+    `driver` is any object with `play`, not opened yet, or a text as ``--driver`` takes it; one with ``loop_back()``
+    makes a new driver for each of the `runs` (>= 1).  The `amplitude` (> 0) is that of the burst, in the unit of the
+    drive; of full scale for a sound card.  A ValueError where an argument is out of its bound, or the driver senses
+    nothing; a DriverError where nothing of what was played is sensed, samples were lost in most of the runs, or the
+    runs disagree.
     """
     if runs < 1 or not 0 < amplitude < np.inf:
         raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")

@@ -30,26 +30,12 @@ def sweep(
     executor: Executor | None = None,
     at_a_time: int = AT_A_TIME,
 ) -> list[Any]:
-    """Render every scene on its simulated device and return what `judge` makes of each recording.
+    """Render every scene, of any device, on its simulated device; return in order what `judge` makes of each recording.
 
-    Parameters
-    ----------
-    scenes : iterable of Scene
-        Of any device; results come in their order.
-    judge : callable, optional
-        From a `Recording` to what is kept; a function of a module for an executor of other processes.  Default: the
-        recording's summary.
-    method : str, optional
-        Name of the control method; default: that of each scene.
-    executor : concurrent.futures.Executor, optional
-        Default: this thread.
-    at_a_time : int
-        Scenes a task of the executor, >= 1.
-
-    Raises
-    ------
-    SweepError
-        A scene failed; tasks that have not begun are cancelled.
+    `judge` takes a `Recording` and returns what is kept of it, by default its summary; for an executor of other
+    processes it is a function of a module.  `method` is the name of a control method, by default that of each scene;
+    `executor` is by default this thread, and gets `at_a_time` (>= 1) scenes a task.  A `SweepError` where a scene
+    fails; tasks that have not begun are cancelled.
 
     Examples
     --------

@@ -131,10 +131,6 @@ def fit_finger(
     loads : (float, float), N
         The class of loads: least (included) and largest (excluded).
 
-    Returns
-    -------
-    FingerFit
-
     Raises
     ------
     ValueError

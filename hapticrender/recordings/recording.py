@@ -36,23 +36,14 @@ class Recorder:
     name untouched.  Later blocks are collected and handed to the operating system every 0.25 s of signal, and when the
     recorder closes, also after an exception: a killed process loses 0.25 s at most, a failing one nothing.
 
-    Parameters
-    ----------
-    path : path-like or None
-        Journal to write, suffix .au; None keeps the run in memory.
-    scene : Scene
-        What is rendered.
-    requested : callable, optional
-        ``requested(time, position, velocity)`` gives the reference (see ``protocols.Rendering``), a quarter of a second
-        at a time, so that no block waits for it; without it the reference is appended like the other signals.
-    **header
-        The other fields of `journal.Header`: method, seed, rate (Hz) and bands, and whatever differs from two coils
-        (A) and two sensors (m) with places "centre", "end 1" and "end 2" of known motion.
+    `path` is that of the journal, suffix .au; None keeps the run in memory.  ``requested(time, position, velocity)``
+    gives the reference (see ``protocols.Rendering``), a quarter of a second at a time, so that no block waits for it;
+    without it the reference is appended like the other signals.  `header` holds the other fields of `journal.Header`:
+    method, seed, rate (Hz) and bands, and whatever differs from two coils (A) and two sensors (m) with places "centre",
+    "end 1" and "end 2" of known motion.
 
-    Raises
-    ------
-    ValueError, TypeError
-        The path does not end in .au, a file of that name is no journal, or a field is out of its bounds.
+    A ValueError or TypeError where the path does not end in .au, a file of that name is no journal, or a field is out
+    of its bounds.
     """
 
     def __init__(
@@ -89,8 +80,8 @@ class Recorder:
         `drive` (n, channels) as commanded in each interval; `sensed` (n, channels); `motion` (n, places), true or the
         best estimate; finger `position` (n,), m, NaN while lifted; `normal_load` (n,), N; `reference` (n,), the texture
         as the scene specifies it; `target` (n, n_bands), the envelopes that the controller makes of it; `flags` (n,),
-        ``protocols.Flag``.  Units are those of the header.  The first
-        block's `motion_source` replaces that of the header.
+        ``protocols.Flag``.  Units are those of the header.  The first block's `motion_source` replaces that of the
+        header.
         """
         if motion_source is not None and not self._begun and not self._blocks:
             self.header = replace(self.header, motion_source=motion_source)
@@ -200,14 +191,8 @@ class Recording:
     `read` a part of one; units are `header.unit` and `header.drive_unit`, and `header.motion_source` states the
     source of the motion.
 
-    Parameters
-    ----------
-    header : Header
-        Meaning and origin of the columns.
-    frames : ndarray, shape (n, columns), or JournalFrames
-        The signals; those of a journal are read from its file at every access.
-    scene : Scene or None
-        The scene; None parses it from the header at the first access.
+    `header` has meaning and origin of the columns of `frames` (n, columns); those of a journal are read from its file
+    at every access.  Without a `scene` it is parsed from the header at the first access.
     """
 
     def __init__(self, header: Header, frames: Array | journal.JournalFrames, scene: Scene | None = None) -> None:

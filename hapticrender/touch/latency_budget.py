@@ -60,18 +60,10 @@ def position_error(
 ) -> float:
     """Error of the position at which a texture is played (m rms), for a swipe and all its reversals.
 
-    Parameters
-    ----------
-    panel : TouchPanel
-        Sensor of the finger.
-    speed, frequency : float, m/s and Hz
-        Peak speed of a sinusoidal swipe, >= 0, and its frequency, > 0.
-    delay : float, s, >= 0
-        Behind the sensor: from an estimate to the surface, as far as it is not predicted by the device's own loop.
-    predicted : bool
-        False: the last sample is played as it is, without an estimator.
-    smoothing : float, s, >= 0
-        Pole pair by which corrections are spread; 0: none.
+    `speed` (m/s, >= 0) is the peak of a sinusoidal swipe of `frequency` (Hz, > 0); `delay` (s, >= 0) is that behind the
+    sensor, from an estimate to the surface, as far as the device's own loop does not predict it.  Where it is not
+    `predicted`, the last sample is played as it is, without an estimator.  Corrections are spread by a pair of poles
+    of `smoothing` (s, >= 0; 0: none).
     """
     require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
     speed, smoothing = number("speed", speed, "m/s", least=0.0), number("smoothing", smoothing, "s", least=0.0)
