@@ -236,7 +236,7 @@ class Validated:
     """
 
     def __init_subclass__(cls) -> None:
-        above = {name for base in cls.__mro__[1:] for name in vars(base).get("__annotations__", ())}
+        above = {name for base in cls.__mro__[1:] for name in getattr(base, "__dataclass_fields__", ())}
         hints = vars(cls).get("__annotations__", {})
         own = [name for name, hint in hints.items() if name not in above and "ClassVar" not in str(hint)]
         about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}

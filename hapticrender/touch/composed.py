@@ -158,11 +158,6 @@ class _Composed(Composable):
 class Sum(Validated, _Composed):
     """Sum of textures, each times a gain: what ``a + 0.5 * b`` makes.
 
-    Parameters
-    ----------
-    parts : sequence of (texture, gain)
-        Gain between -1e6 and 1e6, 1.
-
     Notes
     -----
     It has the bands of all parts where every part has constant envelopes, those of its only part where it has one;
@@ -178,7 +173,7 @@ class Sum(Validated, _Composed):
 
     kind: ClassVar[str] = "sum"
 
-    parts: Parts = checked(_read_parts, least=-MOST_GAIN, most=MOST_GAIN)
+    parts: Parts = checked(_read_parts, about="textures and their gains, -1e6 to 1e6", least=-MOST_GAIN, most=MOST_GAIN)
 
     def bands(self, rate: float) -> Bands:
         """Bands of all parts for sampling at `rate` (Hz), equal carriers as one."""
@@ -205,13 +200,6 @@ class Sum(Validated, _Composed):
 class Playlist(Validated, _Composed):
     """Textures one after another, each from its own t = 0; after the last the first again.
 
-    Parameters
-    ----------
-    parts : sequence of (texture, duration in s)
-        Duration > 0.
-    fade : float, s
-        In which each comes and goes, 5 ms by default (half of a shorter part); 0: at once.
-
     Examples
     --------
     >>> played = Playlist([(Chirp(start=50.0, stop=200.0, duration=1.0, amplitude=1e-6), 1.0)])
@@ -221,8 +209,8 @@ class Playlist(Validated, _Composed):
 
     kind: ClassVar[str] = "playlist"
 
-    parts: Parts = checked(_read_parts, unit="s", above=0.0, most=LONGEST_PART)
-    fade: float = parameter(5e-3, unit="s", about="in which a part comes and goes; friction is the slope of a texture")
+    parts: Parts = checked(_read_parts, about="textures and durations, > 0", unit="s", above=0.0, most=LONGEST_PART)
+    fade: float = parameter(5e-3, unit="s", about="in which each comes and goes (half of a shorter part); 0: at once")
 
     def bands(self, rate: float) -> Bands:
         """No carriers: the whole waveform is played; a ValueError where `rate` (Hz) does not carry a part's."""

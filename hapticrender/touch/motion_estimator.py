@@ -149,13 +149,16 @@ class MotionEstimator:
         gone = ~(abs(ahead) <= self.patience)  # NaN as well
         h = np.where(gone, 0.0, ahead)
         one, zero, t = np.ones_like(h), np.zeros_like(h), abs(h)
-        errors, values = [], []
-        position, velocity = np.stack([one, h, 0.5 * h * h]), np.stack([zero, one, h])
-        for row, power, divisor, bias in ((position, 5, 20.0, self._bias), (velocity, 3, 3.0, 0.0)):
-            values.append(np.tensordot(self._state, row, 1))
-            spread = np.einsum("i...,ij,j...->...", row, self._covariance, row) + bias
-            errors.append(np.where(gone, np.nan, np.sqrt(spread + self.density * t**power / divisor))[()])
-        return MotionEstimate(np.where(gone, np.nan, values[0])[()], np.where(gone, 0.0, values[1])[()], *errors)
+        rows = np.stack([[one, h, 0.5 * h * h], [zero, one, h]])  # of position and velocity
+        position, velocity = np.einsum("ki...,i->k...", rows, self._state)
+        spread = np.einsum("ki...,ij,kj...->k...", rows, self._covariance, rows)
+        spread += [self._bias + self.density * t**5 / 20.0, self.density * t**3 / 3.0]
+        values = (
+            np.where(gone, np.nan, position),
+            np.where(gone, 0.0, velocity),
+            *np.where(gone, np.nan, np.sqrt(spread)),
+        )
+        return MotionEstimate(*(each[()] for each in values))
 
     def lift(self) -> None:
         """The finger has left: its position is not known until the next sample."""
