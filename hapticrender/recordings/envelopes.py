@@ -5,7 +5,7 @@ The estimator's own smoothing so cancels from every error; pieces are of bounded
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,9 +13,7 @@ from numpy.typing import ArrayLike
 from hapticrender.bands import Bands
 from hapticrender.defaults import LOWEST_FREQUENCY
 from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
+from hapticrender.recordings.recording import Recording
 
 SHORTEST_WINDOW = 20e-3  # s
 FADE_IN = 0.05  # s
@@ -62,7 +60,7 @@ class Envelopes:
         return self.readable & self.has_target & self.finite[:, None]
 
 
-def judged_from(recording: "Recording") -> float:
+def judged_from(recording: Recording) -> float:
     """Time (s) from which a run is judged: after the scene's settling time, or its second half where it is short.
 
     The fade-in of 50 ms at the start is never judged.
@@ -92,7 +90,7 @@ def window_length(bands: Bands, rate: float, position: Array, longest: float) ->
 
 
 @np.errstate(**DIVERGING)
-def analyse(recording: "Recording") -> Envelopes:
+def analyse(recording: Recording) -> Envelopes:
     """Envelopes of every band at every place, by joint least squares over overlapping windows.
 
     Each window fits all carriers of the scene, an offset and a slope to the motion, and the same to the reference
@@ -113,7 +111,7 @@ def analyse(recording: "Recording") -> Envelopes:
     return Envelopes(start=first / rate, window=size / rate, **fields)
 
 
-def _analyse_batch(recording: "Recording", first: Array, size: int) -> dict[str, Array]:
+def _analyse_batch(recording: Recording, first: Array, size: int) -> dict[str, Array]:
     """Fields of `Envelopes` for the windows that begin at samples `first`."""
     bands, rate = recording.bands, recording.rate
     start, stop = (int(first[0]), int(first[-1]) + size) if len(first) else (0, 0)

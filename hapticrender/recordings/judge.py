@@ -1,19 +1,15 @@
 """Judge a recording: figures for every band and place, and a verdict."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, FADE_IN, RUNAWAY, Envelopes, amplitude_error, judged_from
+from hapticrender.recordings.recording import Recording
 from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
 
 READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target

@@ -15,14 +15,13 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
-from hapticrender.recordings import formats, journal, judge
-from hapticrender.recordings.envelopes import Envelopes, analyse
+from hapticrender.recordings import formats, journal
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
-from hapticrender.recordings.waveform_figures import waveform_figures
 
 if TYPE_CHECKING:
     from hapticrender.recordings.columns import Chosen
+    from hapticrender.recordings.envelopes import Envelopes
     from hapticrender.touch.scene import Scene
 
 
@@ -252,15 +251,21 @@ class Recording:
     @cached_property
     def envelopes(self) -> Envelopes:
         """Reference and achieved envelopes over time (computed once)."""
+        from hapticrender.recordings.envelopes import analyse
+
         return analyse(self)
 
     @cached_property
     def waveform(self) -> dict[str, Any]:
         """Figures of the motion against the reference (computed once), see ``waveform_figures``."""
+        from hapticrender.recordings.waveform_figures import waveform_figures
+
         return waveform_figures(self)
 
     def summary(self) -> dict[str, Any]:
         """Figures and verdict as plain numbers, ready for JSON (see ``judge.summary``)."""
+        from hapticrender.recordings import judge
+
         return judge.summary(self)
 
     def text(self) -> str:

@@ -6,23 +6,19 @@ in it.  Over the whole play both come from spectra, windows of 100 ms and contac
 E = rms_B(e)/rms_B(r) is the larger one by both: spectra hardly see the ends, the filter blurs the edges of B.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, judged_from
+from hapticrender.recordings.journal import Header
+from hapticrender.recordings.recording import Recording
 from hapticrender.touch.perception import VELOCITY_PER_FORCE, detection_threshold
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.journal import Header
-    from hapticrender.recordings.recording import Recording
 
 BAND = (20.0, 500.0)  # Hz
 HIGHEST = 0.4  # of the rate: B ends there at low rates

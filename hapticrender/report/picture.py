@@ -1,25 +1,21 @@
 """Draw a recording: target and achieved amplitude, a waveform close-up, errors, drive, finger and verdict."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import textwrap
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hapticrender.formatting import percent
 from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import RUNAWAY
+from hapticrender.recordings.recording import Recording
 from hapticrender.recordings.waveform_figures import LOOSER
 from hapticrender.report import figure as look
 from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure
 from hapticrender.report.text import verdict
-
-if TYPE_CHECKING:
-    from hapticrender.recordings.recording import Recording
 
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
 COILS = (BLUE, ORANGE, GREEN, RED)

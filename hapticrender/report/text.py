@@ -3,12 +3,10 @@
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 from hapticrender.formatting import band_label, degrees, percent, quantity, short, table
-
-if TYPE_CHECKING:
-    from hapticrender.touch.scene import Scene
+from hapticrender.touch.scene import Scene
 
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
 
@@ -124,7 +122,7 @@ def conditions(summary: Mapping[str, Any]) -> str:
     )
 
 
-def describe(scene: "Scene") -> str:
+def describe(scene: Scene) -> str:
     """Describe a scene in a line: its texture, its finger, its length and its device."""
     texture, motion = (getattr(each, "kind", type(each).__name__) for each in (scene.texture, scene.finger.motion))
     sizes = ((getattr(scene.texture, key, None), unit) for key, unit in (("amplitude", "m"), ("frequency", "Hz")))
