@@ -35,7 +35,7 @@ from hapticrender import (
 )
 from hapticrender.analysis import pictures
 from hapticrender.analysis.models import LOAD_CLASSES
-from hapticrender.analysis.page import NAMES
+from hapticrender.analysis.output import NAMES
 from hapticrender.analysis.samples import samples_of
 from hapticrender.plants.fitting import MECHANICAL
 from hapticrender.plants.plate import PlateParameters

@@ -12,7 +12,7 @@ import numpy as np
 
 from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
-from hapticrender.analysis.page import NAMES, SURE, Fits, page_of
+from hapticrender.analysis.output import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
 from hapticrender.analysis.samples import APART, BAND, Samples, by_frequency, samples_of, weighted_mean
 from hapticrender.protocols import Array
