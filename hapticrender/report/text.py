@@ -11,12 +11,6 @@ from hapticrender.touch.scene import Scene
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
 
 
-def waveform_error(summary: Mapping[str, Any]) -> float | None:
-    """Waveform error at the worst place; None where nothing is judged."""
-    found = [figures["waveform_error"] for figures in summary["waveform"]["places"].values() if figures]
-    return max(found, default=None)
-
-
 def at(places: Sequence[str]) -> str:
     """Name where errors are taken, or of which quantity.
 
@@ -28,12 +22,6 @@ def at(places: Sequence[str]) -> str:
         return f"of {' and '.join(MEASURED[name] for name in names)}"
     ends = len(names) > 1
     return "at " + " and ".join(dict.fromkeys("ends" if ends and name.startswith("end ") else name for name in names))
-
-
-def total(bands: Sequence[Mapping[str, Any]], key: str) -> float | None:
-    """Combine `key` ("target" or "achieved", SI) of the judged bands: the root of the sum of squares."""
-    values = [band[key] for band in bands if band["target"] is not None and band["achieved"] is not None]
-    return math.hypot(*values) if values else None
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
@@ -52,13 +40,18 @@ def verdict(summary: Mapping[str, Any]) -> str:
 
 
 def overview(summaries: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Head and rows of a table of scenes: amplitudes, the waveform error at the worst place, the verdict."""
+    """Head and rows of a table of scenes: amplitudes, the waveform error at the worst place, the verdict.
+
+    An amplitude is the root of the sum of squares over the judged bands.
+    """
     rows = [["scene", "target", "achieved", "error", "verdict"]]
     for summary in summaries:
-        sizes = [quantity(total(summary["bands"], key), summary["unit"]) for key in ("target", "achieved")]
-        passed = f"within {100 * summary['tolerance']:.4g} %"
-        found = passed if summary["passed"] else verdict(summary)
-        rows.append([summary["scene"], *sizes, percent(waveform_error(summary)), found])
+        pairs = [(band["target"], band["achieved"]) for band in summary["bands"]]
+        judged = zip(*(pair for pair in pairs if None not in pair), strict=True)
+        sizes = [quantity(math.hypot(*sizes), summary["unit"]) for sizes in judged] or [quantity(None, "")] * 2
+        errors = [figures["waveform_error"] for figures in summary["waveform"]["places"].values() if figures]
+        found = f"within {100 * summary['tolerance']:.4g} %" if summary["passed"] else verdict(summary)
+        rows.append([summary["scene"], *sizes, percent(max(errors, default=None)), found])
     return rows
 
 
