@@ -13,6 +13,7 @@ from typing import Any, NoReturn, Self
 
 import numpy as np
 
+End = float | None  # of a range of numbers; None: open
 LONGEST_LIST = 10_000_000  # numbers in one list of a scene
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 60
@@ -52,21 +53,13 @@ def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
 
 
-def _bound(kind: str, unit: str, above: float | None, least: float | None, most: float | None) -> str:
+def _bound(kind: str, unit: str, above: End, least: End, most: End) -> str:
     parts = [f"> {above:g}"] if above is not None else [f">= {least:g}"] if least is not None else []
     parts += [f"<= {most:g}"] if most is not None else []
     return f"{kind} {' and '.join(parts)} {unit}".replace("  ", " ").strip()
 
 
-def number(
-    key: str,
-    value: Any,
-    unit: str = "",
-    *,
-    above: float | None = None,
-    least: float | None = None,
-    most: float | None = None,
-) -> float:
+def number(key: str, value: Any, unit: str = "", *, above: End = None, least: End = None, most: End = None) -> float:
     """Return `value` as float, if it is a finite real number (no bool) inside its bounds."""
     bound = _bound("a finite number", unit, above, least, most)
     require(_is_number(value), key, value, bound, TypeError)
@@ -213,9 +206,9 @@ def parameter(
     unit: str = "",
     about: str = "",
     *,
-    above: float | None = None,
+    above: End = None,
     least: float = 0.0,
-    most: float | None = None,
+    most: End = None,
 ) -> Any:
     """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`."""
     low: dict[str, Any] = {"least": least} if above is None else {"above": above}

@@ -5,10 +5,11 @@ that slides at 80 mm/s, unless a case states otherwise.  Those of amplitude are 
 "carrier"; its loop is that of the device, whatever method makes the friction.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -43,15 +44,10 @@ def texture(frequencies: Sequence[float], velocity: float) -> Grating:
 
 
 def play(
-    device: str,
-    method: str,
-    touched: Grating,
-    finger: Finger = FINGER,
-    seconds: float = 2.0,
-    **tables: Mapping[str, Value],
+    device: str, method: str, touched: Grating, finger: Finger = FINGER, seconds: float = 2.0, **tables: Any
 ) -> Recording:
     """Render every band of the texture on the simulated device, with further tables of the scene."""
-    scene = Scene(texture=touched, finger=finger, device=device, duration=seconds, keep_unfelt=True, **tables)  # type: ignore[arg-type]
+    scene = Scene(texture=touched, finger=finger, device=device, duration=seconds, keep_unfelt=True, **tables)
     return render(scene, method=method)
 
 

@@ -182,6 +182,7 @@ class Bench:
 
 
 Case = Callable[[Bench], dict[str, float]]
+Fingers = Iterable[tuple[FingerMechanics, float]]
 
 
 def touching(mechanics: FingerMechanics, load: float) -> Finger:
@@ -297,10 +298,7 @@ def sweeps(bench: Bench) -> dict[str, float]:
 
 
 def touch(
-    bench: Bench,
-    amplitude: float = AMPLITUDE,
-    fingers: Iterable[tuple[FingerMechanics, float]] = FINGERS,
-    at: Iterable[float] = PLACES,
+    bench: Bench, amplitude: float = AMPLITUDE, fingers: Fingers = FINGERS, at: Iterable[float] = PLACES
 ) -> dict[str, float]:
     """Touch in 1 ms and lift-off in a sample at 143-400 Hz, worst finger and place: peaks, centre's return and rest."""
     peak, back, left = np.zeros(4), 0.0, 0.0

@@ -135,10 +135,7 @@ METHOD_FREE = frozenset(("identified", *friction.WITHOUT_METHOD))  # cases that 
 
 
 def run_suite(
-    methods: Iterable[str],
-    cases: Iterable[str] = CASES,
-    progress: Callable[[str], None] | None = None,
-    **bench: Any,
+    methods: Iterable[str], cases: Iterable[str] = CASES, progress: Callable[[str], None] | None = None, **bench: Any
 ) -> list[Figure]:
     """Run cases (of `CASES`) and return every figure, target by target, method by method.
 

@@ -13,7 +13,8 @@ from hapticrender.checks import require
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, PARTS, FingerMechanics
 
-LOAD_CLASSES: Mapping[str, tuple[float, float]] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
+Loads = tuple[float, float]  # N: least, and largest, which is excluded
+LOAD_CLASSES: Mapping[str, Loads] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
 FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
 UNITS = {  # of the fit's parameters, which are then near 1: g, N s/m, N/mm
     "mass": 1e-3, "damping": 1.0, "stiffness": 1e3, "phalanx_mass": 1e-3, "phalanx_damping": 1.0,
@@ -186,10 +187,7 @@ def fit_finger(
 
 
 def fit_load_classes(
-    impedance: Source | Sequence[Source],
-    classes: Mapping[str, tuple[float, float]] = LOAD_CLASSES,
-    *,
-    order: int | None = None,
+    impedance: Source | Sequence[Source], classes: Mapping[str, Loads] = LOAD_CLASSES, *, order: int | None = None
 ) -> dict[str, FingerFit]:
     """Fit a finger to every class of loads, as `fit_finger`, by name; a class with too few data is left out.
 
