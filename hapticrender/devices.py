@@ -45,27 +45,17 @@ def registered(group: str, name: str) -> Any:
 def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bool = False) -> "Driver | None":
     """Make the driver that a text names, for a ``with`` statement to open; None for the simulated device.
 
-    Parameters
-    ----------
-    text : str
-        "simulated"; the name of an installed driver, with its argument after a colon ("audio:0", "serial:/dev/ttyACM0",
-        "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a second colon, if
-        anything does.
-    profile : DeviceProfile, optional
-        Of the device: a driver gets those entries of its calibration, by keyword, that its parameters name
-        (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter
-        ``profile`` the profile itself.  A warning names what is stated and not taken.
-    overwrite : bool
-        Handed, where true, to a driver that has a parameter of that name.
+    `text` is "simulated"; the name of an installed driver, with its argument after a colon ("audio:0",
+    "serial:/dev/ttyACM0", "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a
+    second colon, if anything does.  A driver gets those entries of the calibration in the device's `profile`, by
+    keyword, that its parameters name (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``,
+    ``gain_uncertainty``), and a parameter ``profile`` the profile itself; a warning names what is stated and not taken.
+    `overwrite` is handed, where true, to a driver that has a parameter of that name.
 
-    Raises
-    ------
-    ValueError, HapticError, DriverError
-        There is no such driver, or it does not take the argument; a package that it needs is not installed, or cannot
-        be loaded; the device is not there, or the callable raised what is neither a ValueError nor a TypeError.
+    A ValueError where there is no such driver, or it does not take the argument; a HapticError where a package that it
+    needs is not installed, or cannot be loaded; a DriverError where the device is not there, or the callable raised
+    what is neither a ValueError nor a TypeError.
 
-    Examples
-    --------
     >>> open_driver("simulated") is None
     True
     >>> open_driver("wavefile:drive.flac").rate

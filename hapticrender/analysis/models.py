@@ -29,25 +29,14 @@ _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
 class FingerFit:
     """A finger model fitted to measured impedances.
 
-    Parameters
-    ----------
-    mechanics : FingerMechanics
-        The finger at its `reference_load`, the geometric mean of the loads; for ``hr.Finger(mechanics=...)``.
-    load_exponent : float
-        n in ``|Z| ~ (W/reference_load)**n``, one for all frequencies; 0 where the loads do not differ.
-    names : tuple of str
-        Fitted parameters, in the order of `covariance`: fields of `mechanics`, then "load_exponent" if it was fitted.
-    covariance : ndarray, shape (p, p)
-        Of the parameters in SI units, times ``max(1, chi_square/degrees_of_freedom)``.
-    chi_square : float
-        Sum of squares of real and imaginary residuals, each over its standard error.
-    degrees_of_freedom : int
-        Real numbers measured minus parameters fitted.
-    loads : (float, float)
-        Least and largest load in the data (N).
-    bic_margin : float
-        By how much the Bayesian information criterion prefers this order to the other; NaN where the order was given,
-        or the data are too few for the other.
+    `mechanics` is the finger at its `reference_load`, the geometric mean of the loads, for
+    ``hr.Finger(mechanics=...)``; `load_exponent` is n in ``|Z| ~ (W/reference_load)**n``, one for all frequencies, 0
+    where the loads do not differ.  `names` are the fitted parameters: fields of `mechanics`, then "load_exponent" if it
+    was fitted; `covariance`, (p, p) in their order, is that in SI units, times
+    ``max(1, chi_square/degrees_of_freedom)``.  `chi_square` is the sum of squares of real and imaginary residuals, each
+    over its standard error, `degrees_of_freedom` the count of real numbers measured minus that of parameters fitted,
+    `loads` least and largest load in the data (N).  `bic_margin` is by how much the Bayesian information criterion
+    prefers this order to the other; NaN where the order was given, or the data are too few for the other.
 
     Notes
     -----
