@@ -7,9 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hapticrender import checks
 from hapticrender.bands import NYQUIST_MARGIN, Bands
-from hapticrender.checks import Validated, checked, parameter, require
+from hapticrender.checks import Validated, checked, number, parameter, require
 from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array, Texture
 
@@ -118,11 +117,11 @@ class SeparatedTexture:
 
 def _read_parts(key: str, value: Any, **bounds: Any) -> Parts:
     bound = f"1 to {MOST_PARTS} pairs of a texture and a number"
-    checks.require(isinstance(value, list | tuple) and 1 <= len(value) <= MOST_PARTS, key, value, bound, TypeError)
+    require(isinstance(value, list | tuple) and 1 <= len(value) <= MOST_PARTS, key, value, bound, TypeError)
     for index, pair in enumerate(value):
         good = isinstance(pair, list | tuple) and len(pair) == 2 and isinstance(pair[0], Texture)
-        checks.require(good, f"{key}[{index}]", pair, bound, TypeError)
-    return tuple((pair[0], checks.number(f"{key}[{i}][1]", pair[1], **bounds)) for i, pair in enumerate(value))
+        require(good, f"{key}[{index}]", pair, bound, TypeError)
+    return tuple((pair[0], number(f"{key}[{i}][1]", pair[1], **bounds)) for i, pair in enumerate(value))
 
 
 class _Composed(Composable):

@@ -7,8 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from hapticrender import checks
-from hapticrender.checks import Validated, checked
+from hapticrender.checks import Validated, checked, flag, keep, number, numbers, require, rising
 from hapticrender.protocols import Array, Motion
 from hapticrender.touch.mechanics import NONE, FingerMechanics, read_mechanics
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
@@ -21,11 +20,11 @@ LoadCurve = tuple[tuple[float, ...], tuple[float, ...]]
 
 def _read_touches(key: str, value: Any) -> Touches:
     bound = "pairs of on < off in s, each after the one before"
-    checks.require(isinstance(value, list | tuple), key, value, bound, TypeError)
+    require(isinstance(value, list | tuple), key, value, bound, TypeError)
     last, touches = 0.0, []
     for index, pair in enumerate(value):
-        on, off = checks.numbers(f"{key}[{index}]", pair, "s", least=0, most=LONGEST_TIME, count=2)
-        checks.require(last <= on < off, f"{key}[{index}]", pair, bound)
+        on, off = numbers(f"{key}[{index}]", pair, "s", least=0, most=LONGEST_TIME, count=2)
+        require(last <= on < off, f"{key}[{index}]", pair, bound)
         touches.append((on, off))
         last = off
     return tuple(touches)
@@ -34,13 +33,13 @@ def _read_touches(key: str, value: Any) -> Touches:
 def _read_load(value: Any, motion: Motion) -> float | LoadCurve | None:
     if value is None:
         known = callable(getattr(motion, "load", None))
-        checks.require(known, "normal_load", None, "a finite number >= 0 and <= 20 N, as this motion records none")
+        require(known, "normal_load", None, "a finite number >= 0 and <= 20 N, as this motion records none")
         return None
     if not isinstance(value, list | tuple):
-        return checks.number("normal_load", value, "N", least=0, most=MOST_LOAD)
-    checks.require(len(value) == 2, "normal_load", value, "two lists: times in s, loads in N")
-    loads = checks.numbers("normal_load[1]", value[1], "N", least=0, most=MOST_LOAD)
-    return checks.rising("normal_load[0]", value[0], len(loads)), loads
+        return number("normal_load", value, "N", least=0, most=MOST_LOAD)
+    require(len(value) == 2, "normal_load", value, "two lists: times in s, loads in N")
+    loads = numbers("normal_load[1]", value[1], "N", least=0, most=MOST_LOAD)
+    return rising("normal_load[0]", value[0], len(loads)), loads
 
 
 @dataclass(frozen=True)
@@ -74,14 +73,14 @@ class Finger(Validated):
     normal_load: float | LoadCurve | None = 0.0
     touches: Touches | None = checked(_read_touches, None)
     mechanics: FingerMechanics = NONE
-    load_scaling: bool = checked(checks.flag, False)
+    load_scaling: bool = checked(flag, False)
 
     def __post_init__(self) -> None:
         known = isinstance(self.motion, Motion)
-        checks.require(known, "motion", self.motion, "a motion with position(time)", TypeError)
-        checks.keep(self, normal_load=_read_load(self.normal_load, self.motion))
+        require(known, "motion", self.motion, "a motion with position(time)", TypeError)
+        keep(self, normal_load=_read_load(self.normal_load, self.motion))
         super().__post_init__()
-        checks.keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load))
+        keep(self, mechanics=read_mechanics(self.mechanics, self._typical_load))
 
     @classmethod
     def absent(cls) -> Self:

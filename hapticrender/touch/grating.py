@@ -6,9 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hapticrender import checks
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, checked, option, parameter
+from hapticrender.checks import Validated, checked, exactly_one, keep, number, option, parameter, require
 from hapticrender.protocols import Array
 from hapticrender.touch import perception
 from hapticrender.touch.composed import Composable
@@ -29,15 +28,15 @@ SHAPES: dict[str, Callable[[int], Partial]] = {  # partial n of a Fourier series
 
 def _read_partials(key: str, partials: Any) -> tuple[Partial, ...]:
     bound = f"1 to {MOST_PARTIALS} entries of order, amplitude, phase"
-    checks.require(isinstance(partials, list | tuple | np.ndarray), key, partials, bound, TypeError)
-    checks.require(1 <= len(partials) <= MOST_PARTIALS, key, partials, bound)
+    require(isinstance(partials, list | tuple | np.ndarray), key, partials, bound, TypeError)
+    require(1 <= len(partials) <= MOST_PARTIALS, key, partials, bound)
     found = []
     for at, entry in ((f"{key}[{index}]", entry) for index, entry in enumerate(partials)):
         good = isinstance(entry, list | tuple | np.ndarray) and len(entry) == 3
-        checks.require(good, at, entry, "order, amplitude, phase", TypeError)
-        order = checks.number(f"{at}.order", entry[0], "", above=0, most=1e4)
-        amplitude = checks.number(f"{at}.amplitude", entry[1], "times the grating's", least=-100, most=100)
-        found.append((order, amplitude, checks.number(f"{at}.phase", entry[2], "rad", least=-1e6, most=1e6)))
+        require(good, at, entry, "order, amplitude, phase", TypeError)
+        order = number(f"{at}.order", entry[0], "", above=0, most=1e4)
+        amplitude = number(f"{at}.amplitude", entry[1], "times the grating's", least=-100, most=100)
+        found.append((order, amplitude, number(f"{at}.phase", entry[2], "rad", least=-1e6, most=1e6)))
     return tuple(found)
 
 
@@ -80,16 +79,16 @@ class Grating(Validated, Composable):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.exactly_one(frequency=self.frequency, wavelength=self.wavelength)
-        key = checks.exactly_one(amplitude=self.amplitude, velocity=self.velocity, level=self.level)
+        exactly_one(frequency=self.frequency, wavelength=self.wavelength)
+        key = exactly_one(amplitude=self.amplitude, velocity=self.velocity, level=self.level)
         usable = self.spatial and key != "amplitude"
         bound = "left out but where velocity or level of a grating in space is given"
-        checks.require(usable or self.speed is None, "speed", self.speed, bound)
+        require(usable or self.speed is None, "speed", self.speed, bound)
         if key != "amplitude":
-            checks.require(not self.spatial or self.speed is not None, "speed", None, "a finite number >= 1e-06 m/s")
+            require(not self.spatial or self.speed is not None, "speed", None, "a finite number >= 1e-06 m/s")
             frequency = self.frequency or self.speed / self.wavelength  # type: ignore[operator]
             amplitude = _in_metres(key, getattr(self, key), frequency)
-            checks.keep(self, amplitude=amplitude, velocity=None, level=None, speed=None)
+            keep(self, amplitude=amplitude, velocity=None, level=None, speed=None)
 
     @property
     def spatial(self) -> bool:
@@ -126,10 +125,10 @@ def _in_metres(key: str, value: float, frequency: float) -> float:
     """Amplitude (m) of a velocity (m/s) or level (dB) at `frequency` (Hz)."""
     low, high = perception.LOWEST, perception.HIGHEST
     bound = f"stated at {low:g} to {high:g} Hz, where the threshold is known; it is at {frequency:.4g} Hz"
-    checks.require(key == "velocity" or low <= frequency <= high, key, value, bound)
+    require(key == "velocity" or low <= frequency <= high, key, value, bound)
     convert = perception.from_velocity if key == "velocity" else perception.displacement
     with np.errstate(over="ignore", under="ignore"):
         amplitude = float(convert(value, frequency))
     bound = f"<= {MOST_AMPLITUDE} m as an amplitude; at {frequency:.4g} Hz it is {amplitude:.3g} m"
-    checks.require(amplitude <= MOST_AMPLITUDE, key, value, bound)
+    require(amplitude <= MOST_AMPLITUDE, key, value, bound)
     return amplitude

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender import checks
-from hapticrender.checks import Validated, parameter
+from hapticrender.checks import Validated, choice, frequencies, parameter, require
 from hapticrender.protocols import Array
 
 LIGHT_BELOW = 0.5  # N: Table 1 parts its two columns here
@@ -62,15 +61,15 @@ class FingerMechanics(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.require(self.order in (0, 2, 4), "order", self.order, "0, 2 or 4")
+        require(self.order in (0, 2, 4), "order", self.order, "0, 2 or 4")
         for key in PARTS[{0: 0, 2: 3, 4: 6}[self.order] :]:
-            checks.require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
+            require(getattr(self, key) == 0.0, key, getattr(self, key), f"0 where order = {self.order}")
         if self.order and not any(getattr(self, key) for key in PARTS[:3]):
             raise ValueError(f"mass, damping, stiffness = 0: one must be > 0 where order = {self.order}")
 
     def impedance(self, frequency: Array) -> Array:
         """Z_f = F/V_s (complex, N s/m) at `frequency` (Hz, > 0)."""
-        s = 2j * np.pi * checks.frequencies(frequency, zero=False)
+        s = 2j * np.pi * frequencies(frequency, zero=False)
         if self.order == 0:
             return np.zeros_like(s)
         if self.order == 2:
@@ -82,7 +81,7 @@ class FingerMechanics(Validated):
     def skin_velocity_per_force(self, frequency: Array) -> Array:
         """V_s/F (complex, m/(N s)): the surface, and the skin on it, per newton."""
         bound = "2 or 4: a finger without mechanics gives no velocity per force"
-        checks.require(self.order != 0, "order", self.order, bound)
+        require(self.order != 0, "order", self.order, bound)
         return 1 / self.impedance(frequency)
 
     def load_factor(self, normal_load: Array) -> Array:
@@ -112,7 +111,7 @@ def read_mechanics(value: Any, normal_load: Callable[[], float]) -> FingerMechan
     """Mechanics from a name, a table of numbers, or mechanics; "auto" chooses by `normal_load` (N)."""
     if isinstance(value, FingerMechanics | Mapping):
         return FingerMechanics.read("mechanics", value)
-    checks.choice("mechanics", value, ("auto", *NAMED))
+    choice("mechanics", value, ("auto", *NAMED))
     if value == "auto":
         return LIGHT if normal_load() < LIGHT_BELOW else HEAVY
     return NAMED[value]

@@ -6,8 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hapticrender import checks
-from hapticrender.checks import Validated, checked, parameter
+from hapticrender.checks import Validated, checked, exactly_one, file_name, keep, numbers, parameter, require, rising
 from hapticrender.protocols import Array
 from hapticrender.touch.tribometer import MOST_SPEED, SwipeRecording, load_swipe
 
@@ -75,7 +74,7 @@ class SineMotion(Validated):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.exactly_one(speed=self.speed, stroke=self.stroke)
+        exactly_one(speed=self.speed, stroke=self.stroke)
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""
@@ -96,15 +95,15 @@ class Sampled(Validated):
 
     kind: ClassVar[str] = "sampled"
 
-    positions: tuple[float, ...] = checked(checks.numbers, unit="m", least=-FARTHEST, most=FARTHEST)
+    positions: tuple[float, ...] = checked(numbers, unit="m", least=-FARTHEST, most=FARTHEST)
     rate: float | None = parameter(None, "Hz", least=1e-3, most=1e7)  # of the samples, the first at t = 0; or else
     times: tuple[float, ...] | None = None  # s, of each sample, rising, >= 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.exactly_one(rate=self.rate, times=self.times)
+        exactly_one(rate=self.rate, times=self.times)
         if self.times is not None:
-            checks.keep(self, times=checks.rising("times", self.times, len(self.positions)))
+            keep(self, times=rising("times", self.times, len(self.positions)))
 
     @cached_property
     def _curve(self) -> tuple[Array, Array]:
@@ -123,7 +122,7 @@ class RecordedMotion(Validated):
 
     kind: ClassVar[str] = "recorded"
 
-    file: str = checked(checks.file_name)  # .npz as for `Swipe`
+    file: str = checked(file_name)  # .npz as for `Swipe`
     start: float = parameter(0.0, "s", most=LONGEST_TIME)  # where in the recording t = 0 lies
 
     @property
@@ -134,7 +133,7 @@ class RecordedMotion(Validated):
     def check(self) -> None:
         """Read the file, so that a bad one is refused before anything plays."""
         end = self.recording.duration
-        checks.require(self.start <= end, "start", self.start, f"<= {end:g} s, the end of the recording")
+        require(self.start <= end, "start", self.start, f"<= {end:g} s, the end of the recording")
 
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,)), NaN while lifted and outside the recording."""

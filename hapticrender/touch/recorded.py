@@ -8,9 +8,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from hapticrender import checks
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, checked, parameter
+from hapticrender.checks import Validated, checked, exactly_one, file_name, keep, numbers, parameter, require, show
 from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Array
 from hapticrender.touch.composed import Composable
@@ -60,15 +59,15 @@ class _Playback(Validated, Composable):
     gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
     carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
     spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband | None = checked(checks.numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
+    passband: Passband | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.exactly_one(amplitude=self.amplitude, gain=self.gain)
+        exactly_one(amplitude=self.amplitude, gain=self.gain)
         if self.passband is None:
-            checks.keep(self, passband=FELT if self.carriers is None else CARRIED)
+            keep(self, passband=FELT if self.carriers is None else CARRIED)
         low, high = self.passband or FELT
-        checks.require(low < high, "passband", self.passband, "two rising frequencies in Hz")
+        require(low < high, "passband", self.passband, "two rising frequencies in Hz")
 
     @cached_property
     def curve(self) -> Curve:
@@ -174,18 +173,18 @@ class Recorded(_Playback):
 
     kind: ClassVar[str] = "recorded"
 
-    file: str | None = checked(checks.file_name, None)
-    samples: tuple[float, ...] | None = checked(checks.numbers, None, least=-LOUDEST, most=LOUDEST)
+    file: str | None = checked(file_name, None)
+    samples: tuple[float, ...] | None = checked(numbers, None, least=-LOUDEST, most=LOUDEST)
     rate: float | None = parameter(None, "Hz", least=1.0, most=MOST_RATE)
     channel: int = parameter(0, least=0, most=1023)
     speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.exactly_one(file=self.file, samples=self.samples)
-        checks.require(self.samples is None or len(self.samples) >= 2, "samples", self.samples, ">= 2 numbers")
+        exactly_one(file=self.file, samples=self.samples)
+        require(self.samples is None or len(self.samples) >= 2, "samples", self.samples, ">= 2 numbers")
         bound = "left out, as the file has one" if self.samples is None else f"a number of Hz <= {MOST_RATE:g}"
-        checks.require((self.rate is None) == (self.samples is None), "rate", self.rate, bound)
+        require((self.rate is None) == (self.samples is None), "rate", self.rate, bound)
 
     def _speed(self) -> float | None:
         return self.speed
@@ -200,7 +199,7 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
     """One channel of a sound file, and its step (s); memory is bounded by the channel's length; raises `SceneError`."""
     import soundfile
 
-    with naming(f"file = {checks.show(file)}"):
+    with naming(f"file = {show(file)}"):
         if not Path(file).is_file():
             raise ValueError("must be an existing sound file")
         try:
@@ -214,7 +213,7 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
                 parts = [(int(held), int(stated)) for stated, held in _PART.findall(sound.extra_info)]
                 lengths = [(values.size, sound.frames), *(each for each in parts if 0 < each[1] < STREAMED)]
         except (soundfile.SoundFileError, OSError, ValueError, TypeError) as error:
-            raise ValueError(f"must be a readable sound file ({checks.show(str(error))})") from error
+            raise ValueError(f"must be a readable sound file ({show(str(error))})") from error
         if problem:
             raise ValueError(problem)
         share = min(held / stated for held, stated in lengths)
@@ -253,12 +252,12 @@ class Swipe(_Playback):
     kind: ClassVar[str] = "swipe"
     spatial: ClassVar[bool] = True  # type: ignore[misc]  # known without reading the file
 
-    file: str = checked(checks.file_name)
+    file: str = checked(file_name)
 
     def _speed(self) -> float:
         speed = load_swipe(self.file).speed
         if speed == 0.0:
-            name = f"file = {checks.show(self.file)}"
+            name = f"file = {show(self.file)}"
             raise SceneError(f"{name}: the finger never slides in contact: must be > 0.001 m/s")
         return speed
 
@@ -269,7 +268,7 @@ class Swipe(_Playback):
         speed = self._speed()
         values, _ = load_swipe(self.file).force_profile(GRID)
         if values.size < 2:
-            raise SceneError(f"file = {checks.show(self.file)}: slides over {values.size * GRID} m: must be > {GRID} m")
+            raise SceneError(f"file = {show(self.file)}: slides over {values.size * GRID} m: must be > {GRID} m")
         return values, GRID / speed
 
 
