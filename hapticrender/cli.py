@@ -38,7 +38,7 @@ _FULL_SCALE = "of full scale on a sound card, in A or V elsewhere"
 
 
 def _option(names: str, value: str, text: str, kind: Any = str, **settings: Any) -> tuple[list[str], dict[str, Any]]:
-    """An option by its names, or an argument, and its settings; it is a mark where its `value` has no name."""
+    """An option by its names, or an argument, and its settings; where its `value` has no name it is a switch."""
     own = {"metavar": value, "type": kind} if value else {"action": "store_true"}
     return names.split(), {"help": text, **own, **settings}
 

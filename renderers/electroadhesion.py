@@ -72,17 +72,8 @@ class ScreenSetup(FrictionSetup):
         assumed, mu = self.assumed, self.assumed.friction_coefficient
         model = self.contact(driver, mu)
         if driver.sensed_channels and assumed.sensor == "impedance":  # attraction, behind the estimator's low pass
-            lag = assumed.estimator_filter.delay
-            return replace(
-                model,
-                mass=lag**2 / 2 / mu * model.force_from_drive,
-                damping=lag / mu * model.force_from_drive,
-                coordinate_from_sensed=mu * model.coordinate_from_sensed,
-                contact_damping=0.0,
-                sensor_delay=lag,
-                contact_lag=assumed.memory_length,
-                inferred=True,
-            )
+            lag, sensed = assumed.estimator_filter.delay, mu * model.coordinate_from_sensed
+            return replace(self.inferred(model, lag), coordinate_from_sensed=sensed, sensor_delay=lag)
         return model
 
 

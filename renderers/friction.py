@@ -175,6 +175,11 @@ class FrictionSetup:
             ),
         )
 
+    def inferred(self, model: DeviceModel, lag: float) -> DeviceModel:
+        """Return `model` where friction is inferred from what follows the drive by a `lag` (s), before the contact."""
+        mass, damping, contact = lag**2 / 2 * model.stiffness, lag * model.stiffness, self.assumed.memory_length
+        return replace(model, mass=mass, damping=damping, contact_damping=0.0, contact_lag=contact, inferred=True)
+
 
 def carrier_limit(limits: Limits) -> float:
     """Largest peak (drive unit) of a carrier within the limits of peak and rms drive; the rms is that of a sine."""

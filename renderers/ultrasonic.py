@@ -9,8 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-
 from hapticrender.bands import Bands
 from hapticrender.checks import inside, require
 from hapticrender.control.device_model import Demand, DeviceModel
@@ -118,16 +116,6 @@ def _model(setup: SurfaceSetup, driver: Driver | Port) -> DeviceModel:
     assumed, lag = setup.assumed, 0.5 / driver.rate
     model = setup.contact(driver, 1.0)
     if driver.sensed_channels and assumed.sensor == "amplitude":  # no contact and no tribometer between
-        return replace(
-            model,
-            mass=lag**2 / 2 * np.eye(1),
-            damping=lag * np.eye(1),
-            stiffness=np.eye(1),
-            contact_damping=0.0,
-            sensor_delay=0.0,
-            contact_lag=assumed.memory_length,
-            inferred=True,
-            sensed_noise=LEAST_NOISE * model.sensed_limit,
-        )
+        return replace(setup.inferred(model, lag), sensor_delay=0.0, sensed_noise=LEAST_NOISE * model.sensed_limit)
     mass = model.mass + lag * model.damping + lag**2 / 2 * model.stiffness
     return replace(model, mass=mass, damping=model.damping + lag * model.stiffness)
