@@ -235,12 +235,11 @@ class Validated:
         about = {name: getattr(vars(cls).get(name), "metadata", {}) for name in own}
         text = inspect.cleandoc(cls.__doc__ or "")
         if about and "Parameters\n---" not in text and all("about" in each for each in about.values()):
-            kinds = (hint if isinstance(hint, str) else inspect.formatannotation(hint) for hint in hints.values())
-            kind = {name: re.sub(r"\b[a-z][\w.]*\.(?=\w)", "", each) for name, each in zip(hints, kinds, strict=True)}
-            heads = (f"{name} : {kind[name]}, {each.get('unit', '')}" for name, each in about.items())
-            rows = [
-                f"{head.rstrip(', ')}\n    {each['about']}." for head, each in zip(heads, about.values(), strict=True)
-            ]
+            rows = []
+            for name, each in about.items():  # types without their modules
+                hint = hints[name].__name__ if isinstance(hints[name], type) else str(hints[name])
+                kind = re.sub(r"\b[a-z][\w.]*\.(?=\w)", "", hint)
+                rows += [f"{name} : {kind}, {each.get('unit', '')}".rstrip(", "), f"    {each['about']}."]
             summary, *rest = re.split(r"\n\n(?=\w+\n-{3,}\n)", text, maxsplit=1)
             cls.__doc__ = "\n\n".join([summary, "\n".join(["Parameters", "-" * 10, *rows]), *rest])
 
