@@ -23,7 +23,6 @@ from hapticrender.player import Player
 from hapticrender.protocols import Rendering
 from hapticrender.recordings.recording import Recording
 from hapticrender.report import outputs
-from hapticrender.report.outputs import check_file, check_folder
 from hapticrender.report.page import write_page
 from hapticrender.report.text import conditions, describe, figures, overview, progress, verdict
 from hapticrender.touch.builtin_scenes import builtin_scenes
@@ -46,7 +45,7 @@ def _check_run_folders(folders: list[Path], arguments: argparse.Namespace, sourc
     The page is in the folder of ``--out``, where `folders` are below it.
     """
     for folder in folders:
-        check_folder("--out", folder)
+        outputs.check_folder("--out", folder)
         if not arguments.force:
             outputs.refuse_to_overwrite(folder, source)
             if folder != arguments.out:
@@ -151,11 +150,11 @@ def validate(arguments: argparse.Namespace) -> int:
     references = arguments.scenes or list(builtin_scenes())
     for option, path, _ in reports:
         if path:
-            check_file(option, path)
+            outputs.check_file(option, path)
             if path.exists() and any(Path(other).exists() and path.samefile(other) for other in references):
                 raise ValueError(f"{option} = {str(path)!r}: is a scene, must be another file")
     if arguments.out:
-        check_folder("--out", arguments.out)
+        outputs.check_folder("--out", arguments.out)
     options = {name: getattr(arguments, name) for name in ("method", "seed", "jobs", "out", "driver")}
     verdicts = validation.validate(references, **options, progress=sys.stderr)
     if rendered := [each.summary for each in verdicts if each.summary]:
@@ -186,7 +185,7 @@ def _suite(arguments: argparse.Namespace) -> int:
     if arguments.junit or arguments.out or arguments.jobs > 1:
         raise ValueError("--suite runs in one process, and writes --json only")
     if arguments.json:
-        check_file("--json", arguments.json)
+        outputs.check_file("--json", arguments.json)
     methods, cases, bench = list(dict.fromkeys((chosen, "paper"))), CASES, dict[str, Any]()
     if arguments.driver != SIMULATED:
         methods, cases = [chosen], tuple(case for case in plate.CASES if case != "overload")  # that has its own plate
@@ -217,7 +216,7 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.touch.finger import Finger
 
     if arguments.out:
-        check_file("--out", arguments.out)
+        outputs.check_file("--out", arguments.out)
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     found: Any
     with naming_driver(arguments.driver), naming(arguments.scene or "identify"):
@@ -268,7 +267,7 @@ def finger(arguments: argparse.Namespace) -> int:
     from hapticrender.analysis import output, pictures
     from hapticrender.analysis.analyse import analyse_finger
 
-    check_folder("--out", arguments.out)
+    outputs.check_folder("--out", arguments.out)
     for path in [] if arguments.force else [arguments.out / name for name in output.FILES]:
         if path.exists():
             raise ValueError(f"{str(path)!r}: is there: choose another folder, or add --force")
@@ -285,7 +284,7 @@ def latency(arguments: argparse.Namespace) -> int:
     from hapticrender.latency import measure_latency, write_delay
 
     if arguments.out:
-        check_file("--out", arguments.out)
+        outputs.check_file("--out", arguments.out)
     driver: Any = open_driver(arguments.driver)
     stated = "in [device] of the scene" if driver is None else ""
     if hasattr(driver, "driven_by_host"):  # the loop runs on a board
@@ -306,7 +305,7 @@ def export(arguments: argparse.Namespace) -> int:
     """Write a scene's controller as C sources."""
     from hapticrender.export import export
 
-    check_folder("--out", arguments.out)
+    outputs.check_folder("--out", arguments.out)
     scene = _scene(arguments.scene)
     with naming(arguments.scene):
         written = export(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)

@@ -16,7 +16,6 @@ from hapticrender.bands import Bands
 from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal
-from hapticrender.recordings.formats import MissingExtra
 from hapticrender.recordings.journal import Header
 
 if TYPE_CHECKING:
@@ -283,7 +282,7 @@ class Recording:
 
         try:
             picture.plot(self, path)
-        except MissingExtra as error:
+        except formats.MissingExtra as error:
             warnings.warn(f"{path} is not drawn: {error}; the recording can be saved", stacklevel=2)
             return False
         return True

@@ -13,8 +13,7 @@ from hapticrender.protocols import Array
 from hapticrender.recordings.envelopes import RUNAWAY
 from hapticrender.recordings.recording import Recording
 from hapticrender.recordings.waveform_figures import LOOSER
-from hapticrender.report import figure as look
-from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure
+from hapticrender.report.figure import BLUE, GREEN, INK, ORANGE, PALE, RED, check_format, legend, new_figure, save
 from hapticrender.report.text import verdict
 
 PLACES = ((BLUE, "o"), (ORANGE, "<"), (GREEN, ">"))
@@ -37,7 +36,7 @@ FLOOR = 1e-5  # relative error below which a dot stands at the foot of its panel
 def plot(recording: Recording, path: str | os.PathLike[str]) -> None:
     """Draw a recording into one .png, .svg or .pdf; an older file is replaced when the new one is whole."""
     path = check_format(path)
-    look.save(draw(recording), path)
+    save(draw(recording), path)
 
 
 def draw(recording: Recording) -> Any:
