@@ -114,17 +114,14 @@ def fit_finger(
     Parameters
     ----------
     impedance : FingerRecord, Impedance, or a sequence of them
-        As measured, in one or several recordings; masked entries (NaN) are left out.  All errors of an Impedance count
-        as independent; those of a FingerRecord are in part shared, see the notes.
+        As measured, in one or several recordings; masked entries (NaN) are left out, a standard error of 0 is a
+        ValueError.  All errors of an Impedance count as independent; those of a FingerRecord are in part shared, see
+        the notes.
     order : {2, 4} or None
-        None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.
+        None takes the order that the data support: the 4th where the Bayesian information criterion is smaller.  A
+        ValueError where there are too few different carriers (2 for the 2nd order, 4 for the 4th).
     loads : (float, float), N
         The class of loads: least (included) and largest (excluded).
-
-    Raises
-    ------
-    ValueError
-        Too few different carriers (2 for the 2nd order, 4 for the 4th), or a standard error of 0.
 
     Notes
     -----

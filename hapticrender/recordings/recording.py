@@ -313,7 +313,8 @@ class Recording:
         """Make a recording of what another program has recorded, for analysis, pictures and `save`.
 
         A column is chosen by its name, with a scale, or a scale and an offset: ``{"adc1": (122e-9, 8192)}`` is ``122e-9
-        (adc1 - 8192)``; a name, or a list of names, is scaled by 1.
+        (adc1 - 8192)``; a name, or a list of names, is scaled by 1.  A ValueError or TypeError where a column is
+        missing, has no numbers or another length; a value is not finite; times are not even.
 
         Parameters
         ----------
@@ -338,11 +339,6 @@ class Recording:
         **header
             `name`, `device` (kind, or file of a profile), `unit` of the sensors ("m"), `drive_unit` ("A"),
             `sensed_noise`, and other fields of `hapticrender.recordings.journal.Header`.
-
-        Raises
-        ------
-        ValueError, TypeError
-            A column is missing, has no numbers or another length; a value is not finite; times are not even.
 
         Examples
         --------
