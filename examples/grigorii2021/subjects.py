@@ -34,9 +34,9 @@ from hapticrender import (
     render,
 )
 from hapticrender.analysis import pictures
+from hapticrender.analysis.load_law import Samples
 from hapticrender.analysis.models import LOAD_CLASSES
 from hapticrender.analysis.output import NAMES
-from hapticrender.analysis.samples import samples_of
 from hapticrender.plants.fitting import MECHANICAL
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_BELOW
@@ -200,7 +200,7 @@ def _of_table(name: str, given: float, fitted: float) -> Claim:
 
 def _apart(records: Sequence[FingerRecord], finger: FingerMechanics, kind: str) -> Array:
     """Difference (%) of a finger, at each window's load, from the mean |Z_f| at each of the eight frequencies."""
-    samples = samples_of(records, LOAD_CLASSES[kind])
+    samples = Samples.of(records, LOAD_CLASSES[kind])
     model = np.abs(finger.impedance(samples.frequency)) * finger.load_factor(samples.load)
     own = np.abs(samples.frequency / FREQUENCIES[:, None] - 1) < 0.01
     return 100 * np.abs(own @ model / (own @ np.abs(samples.value)) - 1)

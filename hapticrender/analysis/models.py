@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.analysis.load_law import APART, Samples, Source, parts_of
 from hapticrender.analysis.records import FingerRecord
-from hapticrender.analysis.samples import APART, Samples, Source, parts_of, samples_of
 from hapticrender.checks import require
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, PARTS, FingerMechanics
@@ -152,7 +152,7 @@ def fit_finger(
     (2, 200, 2.6)
     """
     require(order in (None, 2, 4), "order", order, "2, 4 or None")
-    samples = samples_of(impedance, loads)
+    samples = Samples.of(impedance, loads)
     found, fewest = _carriers(samples), FEWEST[order or 2]
     if found < fewest:
         raise ValueError(
@@ -183,7 +183,7 @@ def fit_load_classes(
     return {
         name: fit_finger(impedance, order, loads=loads)
         for name, loads in classes.items()
-        if _carriers(samples_of(impedance, loads)) >= fewest
+        if _carriers(Samples.of(impedance, loads)) >= fewest
     }
 
 
@@ -224,7 +224,7 @@ def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None
 
     names, logs = PARTS[: 3 * order // 2], np.log(samples.load)
     fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": 0.0}
-    if np.ptp(logs) > APART:
+    if samples.loads_differ:
         names = (*names, "load_exponent")
     units, weight, count = np.array([UNITS[name] for name in names]), 1 / samples.standard_error, len(names)
 

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import load_exponent, mean_exponent
+from hapticrender.analysis.load_law import load_exponent, mean_exponent, weighted_mean
 from hapticrender.analysis.models import UNITS, FingerFit
 from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
-from hapticrender.analysis.samples import weighted_mean
 from hapticrender.formatting import as_json, table
 from hapticrender.protocols import Array
 from hapticrender.report.page import NO_PICTURE, html_page, html_row, html_table

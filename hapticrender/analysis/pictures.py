@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import LoadLaw, load_exponent, mean_exponent
+from hapticrender.analysis.load_law import BAND, LoadLaw, Samples, load_exponent, mean_exponent, weighted_mean
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.output import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
-from hapticrender.analysis.samples import APART, BAND, Samples, by_frequency, samples_of, weighted_mean
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
 from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
@@ -43,8 +42,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     folder.mkdir(parents=True, exist_ok=True)
     fits = fit_all(records)
     drawn: dict[str, Any] = {f"time-{i}.png": partial(draw_time, each) for i, each in enumerate(records, 1)}
-    load = samples_of(records).load
-    if load.size and np.ptp(np.log(load)) >= APART:  # how the impedance grows with the load is in the data
+    if Samples.of(records).loads_differ:
         drawn["load.png"] = partial(draw_load, records)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
@@ -101,11 +99,11 @@ def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> 
 
 def draw_frequency(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
     """Draw modulus and phase of the impedance over frequency, with both fits and their 95 % bands, a class a column."""
-    size = np.abs(samples_of(records).value)
+    size = np.abs(Samples.of(records).value)
     with new_figure((max(5.4 * len(fits), 7), 6.2), pads=(0.1, 0.08)) as figure:
         panels = figure.subplots(2, len(fits), sharex=True, sharey="row", squeeze=False, height_ratios=[1.5, 1])
         for (name, of_class), column in zip(fits.items(), panels.T, strict=True):
-            _over_frequency(column, name, of_class, samples_of(records, LOAD_CLASSES[name]))
+            _over_frequency(column, name, of_class, Samples.of(records, LOAD_CLASSES[name]))
         panels[0, 0].set_ylim(0.6 * np.quantile(size, 0.01), 1.7 * np.quantile(size, 0.99))
         panels[0, 0].set_ylabel("|Z_f| (N s/m)")
         low, high = panels[1, 0].get_ylim()
@@ -204,7 +202,7 @@ def _kinematics(axes: Any, record: FingerRecord) -> None:
 
 def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None:
     """The paper's Fig. 8 C: windows as dots, a fitted power a frequency, and mean and deviation of every recording."""
-    bins = by_frequency(samples_of(records))
+    bins = Samples.of(records).by_frequency()
     chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
     for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
         label = f"{np.median(samples.frequency):.0f} Hz"
@@ -227,7 +225,7 @@ def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None
     """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
     label: str | None = f"each at {frequency:.0f} Hz"
     for record in records:
-        bins = by_frequency(samples_of(record))
+        bins = Samples.of(record).by_frequency()
         near = [each for each in bins if abs(np.log(np.median(each.frequency) / frequency)) < BAND]
         if near:
             load, size = near[0].load, np.abs(near[0].value)
@@ -274,7 +272,7 @@ def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], sampl
     samples = samples._replace(value=samples.value * growth, standard_error=samples.standard_error * growth)
     grid = np.geomspace(samples.frequency.min(), samples.frequency.max(), 300)
     views: tuple[Callable[[Array], Array], ...] = (np.abs, lambda z: np.degrees(np.angle(z)))
-    bins = by_frequency(samples)
+    bins = samples.by_frequency()
     frequency = np.array([np.median(each.frequency) for each in bins])
     mean, error = np.array([weighted_mean(each.value, each.standard_error) for each in bins]).T
     bars = SURE * error.real, np.degrees(SURE * error.real / np.abs(mean))
