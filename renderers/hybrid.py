@@ -132,14 +132,11 @@ class HybridRenderer(BaseRenderer):
 
     def plant(self, setup: HybridSetup, seed: int) -> HybridPlant:
         """Return the simulated device with the scene's finger on it."""
-        plate = self._plate.plant(setup.plate, seed)
-        own = seed + 2**32  # noise of its own
-        silent = setup.friction is None
-        screen = (
-            ElectroadhesionScreen(setup.screen.simulated, setup.scene.finger, own)
-            if silent
-            else self._screen.plant(setup.friction, own)
-        )
+        plate, own = self._plate.plant(setup.plate, seed), seed + 2**32  # noise of its own
+        if setup.friction is None:
+            screen = ElectroadhesionScreen(setup.screen.simulated, setup.scene.finger, own)
+        else:
+            screen = self._screen.plant(setup.friction, own)
         return HybridPlant(plate, screen, setup.velocity_per_force)
 
     def connect(self, setup: HybridSetup, driver: Driver) -> Driver:

@@ -57,12 +57,8 @@ class VibrotactileRenderer(BaseRenderer):
 
     def probe(self, setup: PlateSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes the wiring of two coils and two sensors, unless driver or scene say no."""
-        allowed = setup.probe and getattr(driver, "probe", True)
-        return (
-            partial(probe_plate, model=model)
-            if allowed and setup.assumed.coils == driver.sensed_channels == 2
-            else None
-        )
+        whole = setup.assumed.coils == driver.sensed_channels == 2
+        return partial(probe_plate, model=model) if setup.probe and getattr(driver, "probe", True) and whole else None
 
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""

@@ -157,14 +157,10 @@ def _fits(fits: Fits) -> str:
     flat = [(name, fit) for name, of_class in fits.items() for _, fit in sorted(of_class.items())]
     rows = [(escape(label), *(_value(fit, name) for _, fit in flat)) for name, label in LABELS.items()]
     p_values = ["&lt;0.001" if fit.p_value < 1e-3 else f"{fit.p_value:.3f}" for _, fit in flat]
-    supported = [
-        "too few frequencies to compare"
-        if len(fits[name]) == 1
-        else f"yes, by {fit.bic_margin:.3g}"
-        if isfinite(fit.bic_margin)
-        else "no"
-        for name, fit in flat
-    ]
+    supported = []
+    for name, fit in flat:
+        found = f"yes, by {fit.bic_margin:.3g}" if isfinite(fit.bic_margin) else "no"
+        supported.append(found if len(fits[name]) > 1 else "too few frequencies to compare")
     rows += [
         ("loads", *(f"{fit.loads[0]:.2f} to {fit.loads[1]:.2f} N" for _, fit in flat)),
         ("χ² / degrees of freedom", *(f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" for _, fit in flat)),

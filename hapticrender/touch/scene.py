@@ -311,12 +311,10 @@ def _read_kind(table: Any, key: str, choice: str, kinds: Kinds, folder: Path, ex
         given = {entry.name: table[entry.name] for entry in entries if entry.name in table}
         values: dict[str, Any] = dict.fromkeys(required) | given
         if isinstance(values.get("parts"), list):  # pairs of a texture and a number; others are the texture's to refuse
-            values["parts"] = [
-                (_read_kind(part[0], f"parts[{i}][0]", "kind", TEXTURES, folder), part[1])
-                if isinstance(part, list) and len(part) == 2
-                else part
-                for i, part in enumerate(values["parts"])
-            ]
+            values["parts"] = parts = list(values["parts"])
+            for i, part in enumerate(parts):
+                if isinstance(part, list) and len(part) == 2:
+                    parts[i] = _read_kind(part[0], f"parts[{i}][0]", "kind", TEXTURES, folder), part[1]
         if isinstance(values.get("file"), str) and values["file"].isprintable():
             values["file"] = str(folder / values["file"]) if values["file"] else ""
         return kind(**values)
