@@ -236,8 +236,7 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> tu
     if folder is not None:
         outputs.refuse_to_overwrite(folder)
     with tempfile.TemporaryDirectory() as scratch, outputs.naming_full(place := folder or Path(scratch)):
-        journal = outputs.begin_outputs(place, rendering.scene)
-        recording = outputs.run_to_end(rendering, journal=journal, progress=tick)
+        recording = outputs.run_to_end(place, rendering, tick)
         summary, warned = recording.summary(), recording.warnings
         if folder is not None and not summary["passed"]:
             return dict(outputs.write_outputs(folder, recording).summary), warned

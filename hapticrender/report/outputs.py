@@ -3,18 +3,18 @@
 import errno
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hapticrender.errors import PlateMismatch
 from hapticrender.formatting import as_json
-from hapticrender.loop import run
-from hapticrender.protocols import Rendering
+from hapticrender.loop import Progress, run
+from hapticrender.protocols import Driver, Rendering
 from hapticrender.recordings.formats import MissingExtra, replacing, write_sound
-from hapticrender.recordings.journal import read_journal
+from hapticrender.recordings.journal import read_journal, refuse_others
 from hapticrender.recordings.recording import Recording
 from hapticrender.report import picture
 from hapticrender.touch.scene import Scene
@@ -108,27 +108,40 @@ def naming_full(folder: str | Path) -> Iterator[None]:
         raise
 
 
-def run_to_end(rendering: Rendering, **options: Any) -> Recording:
-    """`hapticrender.loop.run`, in which a device that differs from its model is no error where warnings are."""
-    try:
-        return run(rendering, **options)
-    except PlateMismatch as mismatch:
-        if mismatch.recording is None:
-            raise
-        with warnings.catch_warnings():
-            warnings.simplefilter("always")
-            warnings.warn(str(mismatch), PlateMismatch, stacklevel=2)
-        return mismatch.recording
+def run_to_end(folder: Path, rendering: Rendering, progress: Progress | None = None) -> Recording:
+    """Run a prepared `rendering`, its journal in `folder`, which is made where it is not there.
 
-
-def run_into(folder: Path, rendering: Rendering, *, progress: Callable[[float, float], None] | None = None) -> Outputs:
-    """Run a prepared `rendering` and write everything about it into `folder`, which is made where it is not there.
-
-    Files of an earlier run are removed first, so that all files are of this run, also after an interruption.
+    Files of an earlier run are removed once the device is open and probed: all files are then of this run, also after
+    an interruption.  A device that differs from its model is no error where warnings are.
     """
+    journal = folder / JOURNAL
+    with ExitStack() as at_end:
+
+        def begin(device: Driver) -> None:
+            if rendering.probe is not None:
+                rendering.probe(device)
+            at_end.callback(lambda: None if journal.exists() else remove_outputs(folder))
+            begin_outputs(folder, rendering.scene)
+
+        try:
+            refuse_others(journal)
+        except ValueError:  # `refuse_to_overwrite` has refused it, but for --force
+            journal.unlink()
+        try:
+            return run(replace(rendering, probe=begin), journal=journal, progress=progress)
+        except PlateMismatch as mismatch:
+            if mismatch.recording is None:
+                raise
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+                warnings.warn(str(mismatch), PlateMismatch, stacklevel=2)
+            return mismatch.recording
+
+
+def run_into(folder: Path, rendering: Rendering, *, progress: Progress | None = None) -> Outputs:
+    """Run a prepared `rendering` and write everything about it into `folder`; see `run_to_end`."""
     with naming_full(folder):
-        journal = begin_outputs(folder, rendering.scene)
-        return write_outputs(folder, run_to_end(rendering, journal=journal, progress=progress))
+        return write_outputs(folder, run_to_end(folder, rendering, progress))
 
 
 def begin_outputs(folder: Path, scene: Scene) -> Path:
@@ -141,7 +154,7 @@ def begin_outputs(folder: Path, scene: Scene) -> Path:
 
 
 def remove_outputs(folder: Path) -> None:
-    """Remove what `run_into` or `begin_outputs` wrote, and `folder` where nothing else is in it."""
+    """Remove what `run_to_end` wrote, and `folder` where nothing else is in it."""
     for path in written_in(folder):
         path.unlink()
     if not any(folder.iterdir()):
