@@ -13,8 +13,10 @@ addresses closes any plant with any controller, and a third party may give a ste
 from __future__ import annotations
 
 import hashlib
+import inspect
 import sys
 import threading
+import time
 from collections.abc import Callable
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -26,12 +28,13 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
+from hapticrender.errors import HapticError
 from hapticrender.second_core import EXPECTED, await_child, expect, start_child
 
 # no fast mathematics: rounding would depend on what is inlined where, and a process that compiles runs other copies of
 # a part than one that loads from the cache; `hapticrender.vectors` fuses products and sums explicitly
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-ANNOUNCED_AFTER = 1.0  # s: a compilation that takes longer is announced
+ANNOUNCED_AFTER = 1.0  # s of processor time: a load from the cache takes less, on a busy machine too
 ANNOUNCED = threading.Event()
 F8, I8, C16 = types.float64, types.int64, types.complex128
 STEP = types.int64(types.int64, types.int64, types.int64, types.int64)
@@ -84,8 +87,14 @@ def entry(function: Callable[..., Any]) -> Any:
         return numba.njit(function, **OPTIONS)
 
 
-def compiling() -> None:
-    """Start compiling on a second core too, and print once a process that something is being compiled."""
+def announce(done: threading.Event, begun: float) -> None:
+    """Start compiling on a second core too, and print once a process that something is being compiled.
+
+    Not before `ANNOUNCED_AFTER` of processor time from `begun` on, unless it is `done` by then.
+    """
+    while (left := begun + ANNOUNCED_AFTER - time.process_time()) > 0.0:
+        if done.wait(left):
+            return
     start_child()
     if not ANNOUNCED.is_set():
         ANNOUNCED.set()
@@ -110,16 +119,15 @@ class CFunction:
     @cached_property
     def _compiled(self) -> Any:
         await_child(self.function)
-        slow = threading.Timer(ANNOUNCED_AFTER, compiling)
-        slow.daemon = True
-        slow.start()
+        done = threading.Event()
+        threading.Thread(target=announce, args=(done, time.process_time()), daemon=True).start()
         try:
             return numba.cfunc(self.signature, cache=True, **OPTIONS)(keyed(self.function))
         except RuntimeError:
             EXPECTED.clear()  # without a cache a child's work is of no use
             return numba.cfunc(self.signature, **OPTIONS)(self.function)
         finally:
-            slow.cancel()
+            done.set()
 
     def expect(self) -> None:
         """Announce that the address is needed soon, for it to be compiled beside what is needed before."""
@@ -260,3 +268,7 @@ def close_loop(plant, control, count, block):
     for start in range(0, count, block):
         call(plant[0], (plant[1], plant[2], start, block))
         call(control[0], (control[1], control[2], start, block))
+
+
+if inspect.isfunction(close_loop):
+    raise HapticError("NUMBA_DISABLE_JIT is set, must not be: the kernels run as compiled code only: unset it")

@@ -4,11 +4,13 @@ import multiprocessing
 import os
 import subprocess
 import sys
+import threading
+import time
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from hapticrender import second_core
+from hapticrender import jit, second_core
 from hapticrender.plants.plate_kernels import FUNCTIONS
 
 START = """
@@ -74,6 +76,24 @@ def test_a_child_does_not_outlive_its_parent(tmp_path):
     pid = int(lines_of("print(next(iter(second_core.CHILDREN.values())).pid)", tmp_path, ENDLESS)[-1])
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
+
+
+@pytest.mark.parametrize("busy", [False, True], ids=["waits", "computes"])
+def test_what_takes_no_processor_time_is_not_announced_as_compiled(nothing_expected, monkeypatch, capsys, busy):
+    """As a load from the cache on a busy machine, or from a slow disk."""
+
+    def load(*_, **__):
+        end = now() + 5 * jit.ANNOUNCED_AFTER
+        while now() < end:
+            time.sleep(0.0 if busy else 0.01)
+        return lambda function: function
+
+    now = time.process_time if busy else time.monotonic
+    monkeypatch.setattr(jit, "ANNOUNCED_AFTER", 0.1)
+    monkeypatch.setattr(jit, "ANNOUNCED", threading.Event())
+    monkeypatch.setattr(jit.numba, "cfunc", load)
+    jit.CFunction(lambda: 0)._compiled  # noqa: B018
+    assert ("compiling" in capsys.readouterr().err) == busy
 
 
 def started(_=None):
