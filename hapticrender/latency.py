@@ -73,9 +73,11 @@ class Latency:
 
     def __str__(self) -> str:
         milliseconds = 1e3 * self.delay / self.rate
+        cure = "; inverted: swap the two wires of the cable, or of the coils where the card inverts"
         return (
             f"delay {self.delay:.2f} samples ({milliseconds:.3f} ms) at {self.rate:g} Hz in blocks of {self.block}; "
             f"{len(self.trips)} runs, spread {self.spread:.3f} samples, gain of the cable {self.gain:.4g}"
+            f"{cure if self.gain < 0.0 else ''}"
         )
 
 

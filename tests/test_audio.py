@@ -2,6 +2,7 @@
 
 import ctypes
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -252,6 +253,8 @@ def test_the_delay_of_a_loop_is_that_of_its_cable():
     assert found.gain == pytest.approx(-0.1, rel=0.01)
     assert len(found.trips) == 3
     assert "delay 163.50 samples (3.406 ms) at 48000 Hz in blocks of 64; 3 runs, spread 0.00" in str(found)
+    assert "gain of the cable -0.1; inverted: swap the two wires" in str(replace(found, trips=[Trip(1.0, -0.1, 1.0)]))
+    assert "inverted" not in str(replace(found, trips=[Trip(1.0, 0.1, 1.0)]))
 
 
 def test_the_driver_may_be_a_text(monkeypatch):
