@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from hapticrender import __version__, defaults
 from hapticrender.errors import HapticError
-from hapticrender.formatting import printable
+from hapticrender.formatting import closed_pipes, printable
 
 _DESCRIPTION = "Render a texture for a finger on a surface, in closed loop, on a device or on a model of one."
 _EXAMPLES = """\
@@ -151,20 +151,21 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv` (``sys.argv`` by default) and return its exit status."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of small matrices: threads that wait take the other cores
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed, as by `>&-`
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))
+        elif hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")
     try:
         arguments = _parser().parse_args(argv)
         method = getattr(arguments, "method", None)
         if method not in (None, *defaults.METHODS):
             raise ValueError(f"--method = {method!r}: must be one of {', '.join(defaults.METHODS)}")
-        status = _run(arguments)
-        sys.stdout.flush()
+        status = 0
+        with closed_pipes():
+            status = _run(arguments)
         return status
-    except BrokenPipeError:  # the reader of our output has closed it, as in `hapticrender scenes | head -1`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except KeyboardInterrupt:
         return fail("interrupted; what is written so far can be read", 130)
     except (MemoryError, OSError, ValueError, HapticError) as error:
@@ -186,6 +187,8 @@ def _run(arguments: argparse.Namespace) -> int:
         return 0
     try:
         verb = getattr(import_module("hapticrender.verbs"), arguments.verb)  # which takes a second to import
+        if "" not in sys.path:  # a driver's module is looked for in the folder that the command is run in, too
+            sys.path.insert(0, "")
         return verb(arguments)  # type: ignore[no-any-return]
     except SystemExit as error:
         from hapticrender.loop import Terminated

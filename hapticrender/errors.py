@@ -89,9 +89,11 @@ REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, 
 
 @contextmanager
 def naming(where: object) -> Iterator[None]:
-    """Begin every message within with `where`, a file or a scene, in one line, and raise it as a `SceneError`."""
+    """Begin every message within but a driver's with `where`, a file or a scene, and raise it as a `SceneError`."""
     try:
         yield
+    except DriverError:
+        raise
     except REFUSED as problem:
         start, text = f"{' '.join(str(where).split())}: ", str(problem)
         raise SceneError(text if text.startswith(start) else start + text) from problem

@@ -2,10 +2,29 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import Any
 
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
+
+
+@contextmanager
+def closed_pipes() -> Iterator[None]:
+    """End the block, and write nothing more, where the reader of our output has closed it, as `| head -1` does."""
+    try:
+        with suppress(BrokenPipeError):
+            yield
+    finally:
+        for stream in filter(None, (sys.stdout, sys.stderr)):
+            try:
+                stream.flush()
+            except OSError as error:
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+                if not isinstance(error, BrokenPipeError):  # a full disk
+                    raise
 
 
 def quantity(value: float | None, unit: str) -> str:

@@ -17,7 +17,7 @@ from hapticrender.cli import fail
 from hapticrender.devices import SIMULATED, imported, naming_driver, open_driver, registered
 from hapticrender.devices import text as devices_text
 from hapticrender.errors import naming
-from hapticrender.formatting import printable, table
+from hapticrender.formatting import closed_pipes, printable, table
 from hapticrender.loop import prepare
 from hapticrender.player import Player
 from hapticrender.protocols import Rendering
@@ -26,7 +26,7 @@ from hapticrender.report import outputs
 from hapticrender.report.page import write_page
 from hapticrender.report.text import conditions, describe, figures, overview, progress, verdict
 from hapticrender.touch.builtin_scenes import builtin_scenes
-from hapticrender.touch.device_profile import DeviceProfile
+from hapticrender.touch.device_profile import DeviceProfile, table_of
 from hapticrender.touch.scene import Scene
 
 LOOK = 0.25  # s between two looks at what plays
@@ -105,12 +105,11 @@ def play(arguments: argparse.Namespace) -> int:
         _check_run_folders([out / scene.name], arguments)
     journal, above, second = None, 0, 0
     try:
-        with (
-            naming_driver(arguments.driver),
-            naming(arguments.scene),
-            Player(scene, _driver(arguments.driver, scene, arguments.force)) as player,
-        ):
-            player.play(scene.texture)
+        with naming(arguments.scene):
+            player = Player(scene, _driver(arguments.driver, scene, arguments.force))
+        with naming_driver(arguments.driver), player:
+            with naming(arguments.scene), naming_driver(arguments.driver, ValueError, TypeError):
+                player.play(scene.texture)
             if out:
                 journal = outputs.begin_outputs(out / scene.name, scene)
                 player.record(journal)
@@ -153,16 +152,12 @@ def validate(arguments: argparse.Namespace) -> int:
             outputs.check_file(option, path)
             if path.exists() and any(Path(other).exists() and path.samefile(other) for other in references):
                 raise ValueError(f"{option} = {str(path)!r}: is a scene, must be another file")
+    if arguments.json and arguments.junit and arguments.json.resolve() == arguments.junit.resolve():
+        raise ValueError(f"--json, --junit = {str(arguments.json)!r}: must be two files")
     if arguments.out:
         outputs.check_folder("--out", arguments.out)
     options = {name: getattr(arguments, name) for name in ("method", "seed", "jobs", "out", "driver")}
     verdicts = validation.validate(references, **options, progress=sys.stderr)
-    if rendered := [each.summary for each in verdicts if each.summary]:
-        print(printable(table(overview(rendered))))
-    print(validation.counted(verdicts), flush=True)
-    for each in verdicts:
-        if each.verdict == "error":
-            fail(str(each), 2)
     status = validation.exit_status(verdicts, strict=arguments.strict)
     for option, path, write in reports:
         try:
@@ -170,6 +165,13 @@ def validate(arguments: argparse.Namespace) -> int:
                 write(_made(path), verdicts)
         except OSError as error:  # the other report is written all the same
             status = fail(f"{option} = {str(path)!r}: {error.strerror or error}", 2)
+    with closed_pipes():
+        if rendered := [each.summary for each in verdicts if each.summary]:
+            print(printable(table(overview(rendered))))
+        print(validation.counted(verdicts), flush=True)
+        for each in verdicts:
+            if each.verdict == "error":
+                fail(str(each), 2)
     return status
 
 
@@ -200,9 +202,10 @@ def _suite(arguments: argparse.Namespace) -> int:
         cases = tuple(case for case in cases if case in chosen_cases)
     with naming_driver(arguments.driver):
         figures = run_suite(methods, cases, lambda line: print(line, file=sys.stderr), **bench)
-    print(table(as_rows(figures, methods)))
     if arguments.json:
         write_json(_made(arguments.json), figures)
+    with closed_pipes():
+        print(table(as_rows(figures, methods)))
     return 0 if all(figure.passed for figure in figures if figure.method == chosen) else 1
 
 
@@ -215,11 +218,12 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.plants.ultrasonic import UltrasonicPlate
     from hapticrender.touch.finger import Finger
 
+    scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     if arguments.out:
         outputs.check_file("--out", arguments.out)
-    scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
+        scene = _kept(arguments.out, scene)
     found: Any
-    with naming_driver(arguments.driver), naming(arguments.scene or "identify"):
+    with naming(arguments.scene or "identify"), naming_driver(arguments.driver, ValueError, TypeError):
         known = scene.device in ("vt-plate", "ultrasonic", "electroadhesion")
         require(known, "device.kind", scene.device, "vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
@@ -252,6 +256,17 @@ def identify(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _kept(path: Path, scene: Scene) -> Scene:
+    """Take into a scene the limits and the calibration of the profile at `path`, if there is one."""
+    if not path.is_file():
+        return scene
+    there = DeviceProfile.load(path)
+    if there.kind != scene.device:
+        raise ValueError(f"--out = {str(path)!r}: is the profile of a {there.kind}, must be that of a {scene.device}")
+    limits, calibration = table_of(there.limits), table_of(there.calibration)
+    return replace(scene, limits={**scene.limits, **limits}, calibration={**scene.calibration, **calibration})
+
+
 def _profile(found: Any, scene: Scene, arguments: argparse.Namespace) -> DeviceProfile:
     """Profile of an identified device; limits, and what else the scene states of the device, are kept."""
     own, device = scene.device_profile, found.profile()
@@ -274,8 +289,9 @@ def finger(arguments: argparse.Namespace) -> int:
     recording = _recording(arguments.path)
     with naming(arguments.path):
         found = analyse_finger(recording, arguments.profile, block=arguments.block, free_start=arguments.free_start)
+    written = [*output.write(found, arguments.out), pictures.draw(found, arguments.out)]
     print(printable(output.text(found)))
-    _print_written([*output.write(found, arguments.out), pictures.draw(found, arguments.out)])
+    _print_written(written)
     return 0
 
 
@@ -363,10 +379,5 @@ def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: An
 
 
 def _driver(text: str, scene: Scene, overwrite: bool = False) -> Any:
-    """Make the driver of ``--driver``, calibrated as the scene states; None for the simulated device.
-
-    A module of the user's is looked for in the folder that the command is run in, too.
-    """
-    if "" not in sys.path:
-        sys.path.insert(0, "")
+    """Make the driver of ``--driver``, calibrated as the scene states; None for the simulated device."""
     return open_driver(text, scene.device_profile, overwrite)

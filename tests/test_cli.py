@@ -85,6 +85,14 @@ def process(*arguments, **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
+def shell(line, folder, unbuffered="", **environment):
+    """A command line as a shell runs the console script, without the current folder on Python's path."""
+    root = str(Path(__file__).resolve().parent.parent)
+    environment = {**os.environ, "PYTHONPATH": root, "PYTHONUNBUFFERED": unbuffered, **environment}
+    command = ["bash", "-c", f"{sys.executable} -P -m hapticrender {line}"]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
+
+
 def complaint(result):
     """The one line of a refused command."""
     status, out, errors = result
@@ -154,6 +162,7 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
 
 RAISED = [
     (lambda *_: {}["usb"], "hapticrender: other_plate:OtherPlate: KeyError: 'usb'"),
+    (lambda *_: 1 / 0, "hapticrender: other_plate:OtherPlate: ZeroDivisionError: division by zero"),
     (lambda *_: sys.exit(0), "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"),
 ]
 
@@ -183,7 +192,7 @@ def test_a_drive_replaces_its_own_file_and_by_force_any_but_the_texture(run, tmp
 
 @pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
 @pytest.mark.parametrize("method", ["__enter__", "play"])
-@pytest.mark.parametrize(("fails", "line"), RAISED, ids=["raises", "exits"])
+@pytest.mark.parametrize(("fails", "line"), RAISED, ids=["raises", "divides", "exits"])
 def test_what_a_driver_raises_is_one_line(run, tiny, tmp_path, monkeypatch, verb, method, fails, line):
     monkeypatch.setattr(OtherPlate, method, fails)
     status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path / "out").split(), "--driver", "other_plate:OtherPlate")
@@ -220,6 +229,35 @@ def test_nothing_of_others_is_overwritten(run, tmp_path):
     assert (own / "scene.toml").read_text() == TINY
     assert run("render", own / "scene.toml", "--out", other, "--force")[0] == 0
     assert run("render", own / "scene.toml", "--out", other)[0] == 0  # over an earlier run of its own
+
+
+REFUSING = {  # attribute of a driver, and what replaces it so that nothing is recorded; whether the probe runs
+    "it does not open": ("__enter__", lambda *_: 1 / 0, True),
+    "the probe refuses it": ("play", lambda driver, drive: PLAY(driver, -drive), True),
+    "its first block fails": ("play", lambda *_: 1 / 0, False),
+}
+PLAY = OtherPlate.play
+
+
+@pytest.mark.parametrize("case", REFUSING)
+def test_a_run_that_never_starts_leaves_the_earlier_one_and_refuses_no_other(run, tiny, tmp_path, monkeypatch, case):
+    name, fails, probe = REFUSING[case]
+    tiny.write_text(TINY + f"[render]\nprobe = {str(probe).lower()}\n")
+    out, command = tmp_path / "out", ("render", tiny, "--out", tmp_path / "out", "--driver", PLATE)
+    with monkeypatch.context() as patch:
+        patch.setattr(OtherPlate, name, fails)
+        assert run(*command)[0] == 2
+        assert not out.exists()
+    assert run(*command)[0] == 0
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    with monkeypatch.context() as patch:
+        patch.setattr(OtherPlate, name, fails)
+        assert run(*command)[0] == 2
+        assert not probe or {path: path.read_bytes() for path in out.iterdir()} == before
+    assert run(*command)[0] == 0
+    (out / "recording.au").write_text("mine")
+    assert "from no earlier run" in complaint(run(*command))
+    assert run(*command, "--force")[0] == 0
 
 
 def test_scenes_are_listed_and_printed(run):
@@ -304,6 +342,7 @@ BAD_ARGUMENTS = [
     (["render", "no-such-scene", "--out", "{out}"], "no-such-scene: no such file, nor a built-in scene"),
     (["render", "{binary}", "--out", "{out}"], "{binary}: "),
     (["scenes", "no-such-scene"], "no-such-scene: no such built-in scene; there are "),
+    (["validate", "{tiny}", "--json", "{out}", "--junit", "{folder}/../out"], "--json, --junit = '{out}': must be two"),
     (["validate", "{tiny}", "--json", "{folder}"], "--json = '{folder}': is a folder, must be a file"),
     (["show", "{missing}"], "{missing}: no such file"),
     (["show", "{cut}"], "{cut}: not a recording (File is not a zip file)"),
@@ -385,6 +424,39 @@ def test_a_closed_pipe_is_no_error():
         child.stdout.close()
         assert child.stderr.read() == ""
     assert child.returncode == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such redirections on this system")
+@pytest.mark.parametrize(("where", "status"), [("| true", 1), ("2>&1 | true", 1), ("> /dev/full", 2)])
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_status_and_reports_do_not_depend_on_the_output(tmp_path, tiny, where, status, unbuffered):
+    tiny.write_text(TINY.replace("0.1", "0.5") + "[render]\ntolerance = 1e-6\nsettle = 0.2\n")
+    done = shell(f"validate {tiny} --json r.json --junit r.xml {where}; exit ${{PIPESTATUS[0]}}", tmp_path, unbuffered)
+    assert (done.returncode, "Traceback" in done.stderr) == (status, False)
+    assert json.loads((tmp_path / "r.json").read_text())["scenes"][0]["verdict"] == "failed"
+    assert (tmp_path / "r.xml").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such redirections on this system")
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_no_error(tmp_path, tiny, closed):
+    done = shell(f"render {tiny} --out out {closed}", tmp_path)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= SCENE_FILES
+
+
+@pytest.mark.parametrize("verb", ["validate {}", "validate --suite accuracy modulation", "latency"])
+def test_a_driver_may_be_a_module_in_the_current_folder(tmp_path, tiny, verb):
+    """With -P, and so in the console script, that folder is no part of Python's path."""
+    (tmp_path / "mine.py").write_text("def driver(*_, **__):\n    return {}['it is there']\n")
+    done = shell(f"{verb.format(tiny)} --driver mine:driver", tmp_path)
+    assert "mine:driver: KeyError: 'it is there'" in done.stderr
+
+
+def test_kernels_are_not_played_by_python(tmp_path, tiny):
+    done = shell(f"render {tiny} --out out", tmp_path, NUMBA_DISABLE_JIT="1")
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert "NUMBA_DISABLE_JIT is set" in done.stderr
 
 
 values = st.one_of(

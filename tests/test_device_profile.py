@@ -7,6 +7,7 @@ import pytest
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.errors import SceneError
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.recordings.recording import Recording
 from hapticrender.touch.scene import Scene
 
@@ -119,7 +120,7 @@ def test_a_wrong_profile_gets_one_line(tmp_path, text, message):
         hr.DeviceProfile.load(path)
 
 
-def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path):
+def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path, capsys):
     """The simulated plate is 5 % lighter than the profile says; its limits and calibration are not what is measured."""
     (tmp_path / "scene.toml").write_text(
         SCENE.format('device = "devices/plate.toml"\n[simulation]\nmass = 0.0305\nsensor_noise = 1e-7')
@@ -137,6 +138,13 @@ def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path):
         hr.DeviceProfile(**PLATE).calibration,
     )
     hr.prepare(tone(device=str(out)))
+    assert cli.main(["identify", "--out", str(out)]) == 0  # over a file that has them, for a scene that has none
+    again = hr.DeviceProfile.load(out)
+    assert again.device["mass"] == pytest.approx(PlateParameters().mass, rel=1e-3)
+    assert (again.limits, again.calibration) == (found.limits, found.calibration)
+    assert cli.main(["identify", "--scene", "one-texture-ultrasonic", "--out", str(out)]) == 2
+    assert hr.DeviceProfile.load(out) == again
+    assert "is the profile of a vt-plate, must be that of a ultrasonic" in capsys.readouterr().err
 
 
 def test_a_profile_that_a_run_contradicts_is_named(plate):

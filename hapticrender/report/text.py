@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, TextIO
 
-from hapticrender.formatting import band_label, degrees, percent, quantity, short, table
+from hapticrender.formatting import band_label, closed_pipes, degrees, percent, quantity, short, table
 from hapticrender.touch.scene import Scene
 
 MEASURED = {"friction": "friction", "skin": "skin velocity"}  # places that name a quantity, not a position
@@ -144,4 +144,5 @@ def progress(label: str, stream: TextIO) -> Iterator[Callable[[float, float], No
         if terminal:
             print(file=stream)
         raise
-    print(f"\r{label}\x1b[K" if terminal else label, file=stream, flush=True)
+    with closed_pipes():
+        print(f"\r{label}\x1b[K" if terminal else label, file=stream, flush=True)
