@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from hapticrender.accuracy.signals import Modulated, Path, chirp, clicks, pink, sliding, white
 from hapticrender.control.methods import method_named
@@ -55,8 +56,6 @@ class Run(NamedTuple):
 
     def in_band(self) -> tuple[Array, Array]:
         """Reference (n,) and error under the finger and at both ends (n, 3), m, 20 to 500 Hz."""
-        from scipy.signal import butter, sosfiltfilt
-
         sos = butter(4, [20.0, 500.0], "bandpass", fs=1 / self.time[1], output="sos")
         error = self.truth[:, EVERY] - self.reference[:, None]
         return sosfiltfilt(sos, self.reference), sosfiltfilt(sos, error, axis=0)
