@@ -3,6 +3,7 @@
 import json
 import math
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -318,6 +319,22 @@ def test_pieces_of_any_size_give_the_same_figures(rng, monkeypatch):
     monkeypatch.setattr(waveform_figures, "READ_AT_ONCE", 3000)
     found = make_play(noise, 0.9 * noise + 0.1 * np.roll(noise, 3)).waveform["places"]["centre"]
     assert found["window_error"] == pytest.approx(expected["window_error"], rel=1e-4)
+
+
+def test_a_stored_play_of_826e4c4_that_passed_then_fails():
+    """White noise of 5 um by the default of commit 826e4c4, whose verdict was "within its tolerance".
+
+    From 0.5 to 1.5 s of `Recorded(file=..., gain=...)` without a finger, in nm: six carriers, with amplitudes right
+    within 9 %, and a third of the texture's energy.
+    """
+    stored = np.load(Path(__file__).parent / "goldens/h2_826e4c4.npz")
+    reference, motion = (1e-9 * stored[name].astype(float) for name in ("reference", "motion"))
+    summary = make_play(reference, motion).summary()
+    assert summary["verdict"] == "failed"
+    error = np.std(motion[:, 0] - reference) / np.std(reference)
+    assert error > 1.0
+    assert summary["waveform"]["places"]["centre"]["waveform_error"] == pytest.approx(error, rel=0.02)
+    assert make_play(reference, np.repeat(reference[:, None], 3, axis=1)).summary()["verdict"] == "passed"
 
 
 def test_h2_on_white_noise_fails(rng):
