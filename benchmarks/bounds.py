@@ -30,7 +30,7 @@ DAMPED = 2.4, 1.4  # Q of the default plate's damper in heave and rocking (docs/
 REPORT = 5e-3  # s: after which a contact is reported
 RAMP, TRANSIENT = 5, 500  # samples: of a rising load; until every transient is over
 LINES = np.arange(20.0, 401.0, 20.0)  # Hz
-WHITE = np.arange(20.0, 400.5)  # Hz
+WHITE, SWEPT = np.arange(20.0, 400.5), np.arange(30.0, 390.5)  # Hz
 
 
 def bent(frequency: Array, finger: FingerMechanics, position: Array) -> Array:
@@ -43,12 +43,13 @@ def bent(frequency: Array, finger: FingerMechanics, position: Array) -> Array:
     return np.asarray((shape - 1) * forced / (bend + coil * heave - (coil - shape) * (shape - 1) * tissue))
 
 
-def bent_figures(finger: FingerMechanics) -> tuple[float, float, float]:
-    """Worst tone (amplitude, rms over a sliding finger's path), white noise, and a comb of 20 lines, all relative."""
+def bent_figures(finger: FingerMechanics) -> tuple[float, float, float, float]:
+    """Worst tone (amplitude, rms over a slide), white noise, comb, and sweep (in the middle), over the texture."""
     position = sliding(np.arange(0.0, 1.0, 1e-3))
     tones = rms(amplitude_error(1 + bent(np.array(FREQUENCIES), finger, position), 1.0))
     white, comb = (float(rms(bent(each, finger, position), (0, 1))) for each in (WHITE, LINES))
-    return float(tones.max()), white, comb
+    sweep = rms(amplitude_error(1 + bent(SWEPT, finger, np.zeros(1)), 1.0), (0, 1))
+    return float(tones.max()), white, comb, float(sweep)
 
 
 class DampedPlate:
@@ -131,8 +132,9 @@ def touch_figures(late: float, loaded: bool = True) -> tuple[float, float, float
 def main() -> None:
     """Print every bound."""
     for name, finger in (("free", NONE), ("heavy finger", HEAVY)):
-        tone, white, comb = bent_figures(finger)
-        print(f"bent glass, {name}: tones {tone:.2%}, white noise {white:.2%}, comb {20 * np.log10(comb):.1f} dB")
+        tone, white, comb, sweep = bent_figures(finger)
+        figures = f"tones {tone:.2%}, white noise {white:.2%}, comb {20 * np.log10(comb):.1f} dB, sweeps {sweep:.2%}"
+        print(f"bent glass, {name}: {figures}")
     turn = float(sliding(np.array(1.0)))  # where the suite's finger touches
     for place, quality in product((turn, 0.0), (DAMPED, (1.0, 1.0))):
         first = 20 * np.log10(sag_figure(place, quality))
