@@ -150,7 +150,7 @@ SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_dam
 MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
 SCREEN = friction_tone(100.0)
-BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08), "finger": SLIDE}
+BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08, carriers=6), "finger": SLIDE}
 STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
 TO_CARRIER, SLOW = ("electroadhesion", {"output": "carrier"}), {"rate": 79_999, "sensed_channels": 0}
@@ -312,7 +312,7 @@ SCENES = [
     (lambda: rendered(Own(lambda time, x: time[:-1])), r"Own.waveform returned float64 of shape \(\d+,\): must be"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
     (lambda: opened("hybrid", current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
-    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5)), "a recording over time is not supported"),
+    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5, carriers=6)), "a recording over time is not supported"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]
 DRIVERS = [
