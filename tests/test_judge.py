@@ -447,6 +447,27 @@ def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_ten
     assert (summary["bands"][0]["error_end_1"] is None) == (share < 0.05)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "verdict"),
+    [
+        (lambda since: 0.0, "passed"),
+        (lambda since: np.where((since > 4e-3) & (since < 6e-3), 0.1, 0.0), "failed"),  # a click of 0.1 N, once landed
+        (lambda since: np.where(since > 1.0, 0.5, 0.0), "failed"),  # a step of the friction within the touch
+    ],
+)
+def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong, verdict):
+    """It builds up within 3 ms of a touch, and falls a sample after a lift; 20 mN of texture beside 0.5 N of it."""
+    time = times(4.0)
+    touching, since = (time >= 1.0) & (time < 3.5), time - 1.0
+    texture = 20e-3 * np.sin(400 * np.pi * time) * touching
+    base = np.where(touching, 0.5 * -np.expm1(-np.maximum(since, 0.0) / 0.5e-3) + wrong(since), 0.0)
+    motion, bands = texture + np.roll(base, 1), make_bands(100.0, 0.0)
+    position = np.where(touching, 0.0, np.nan)
+    signals = make_signals(bands, 0.0, extra=motion[:, None], position=position) | {"reference": texture}
+    summary = summary_of(bands, signals, {"unit": "N"}, settle=0.5)
+    assert summary["verdict"] == verdict, summary["reason"]
+
+
 def test_a_lost_sample_of_friction_is_lost_alone(rng):
     """The mean friction of a touch is taken off, of what is known of it."""
     noise, bands = white(20, 400, rng, rms=0.01), make_bands(100.0, 0.0)

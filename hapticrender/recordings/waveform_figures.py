@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, judged_from
@@ -45,6 +46,7 @@ LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst wi
 UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
+LANDING = 3e-3  # s: five memory lengths of a contact at 20 mm/s, in which the friction of a touch builds up
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
@@ -127,17 +129,27 @@ def _signals(recording: Recording, start: int, stop: int) -> Array:
     shares, scales = _scales(recording.header)
     reference, motion = recording.read("reference", start, stop), recording.read("motion", start, stop)
     motion = np.where(np.abs(motion) < RUNAWAY, motion, np.nan)
+    landed = np.zeros(len(motion), bool)
     if recording.header.unit == "N":
-        motion = _without_base(motion, np.isfinite(recording.read("position", start, stop)))
-    return np.column_stack([reference, (motion - np.outer(reference, shares)) / scales])
+        landing = min(round(LANDING * recording.rate), start)
+        touching = np.isfinite(recording.read("position", start - landing, stop))
+        felt = np.asarray(sliding_window_view(touching, landing + 1).all(axis=1))
+        motion, landed = _without_base(motion, touching[landing:], felt), touching[landing:] & ~felt
+    error = (motion - np.outer(reference, shares)) / scales
+    error[landed] *= 0.0
+    return np.column_stack([reference, error])
 
 
-def _without_base(friction: Array, touching: Array) -> Array:
-    """Friction (n, places) less its mean over each touch: a touch brings friction of its own, whatever the texture."""
+def _without_base(friction: Array, touching: Array, felt: Array) -> Array:
+    """Friction (n, places) less its mean over each touch, where `felt`: a touch brings friction of its own.
+
+    Without a finger there is none; as that of a touch builds up, nothing else is felt, and nothing is judged.
+    """
     for part in np.split(np.arange(len(touching)), np.flatnonzero(np.diff(touching)) + 1):
-        if part.size:
-            known = np.isfinite(friction[part]).sum(axis=0)  # a lost sample is lost alone
-            friction[part] -= np.nansum(friction[part], axis=0) / np.maximum(known, 1)
+        known = part[felt[part]]
+        count = np.isfinite(friction[known]).sum(axis=0)  # a lost sample is lost alone
+        friction[part] -= np.nansum(friction[known], axis=0) / np.maximum(count, 1)
+    friction[~touching] *= 0.0
     return friction
 
 
