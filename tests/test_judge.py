@@ -337,6 +337,18 @@ def test_a_stored_play_of_826e4c4_that_passed_then_fails():
     assert make_play(reference, np.repeat(reference[:, None], 3, axis=1)).summary()["verdict"] == "passed"
 
 
+@pytest.mark.parametrize("value", [1e200, np.inf, np.nan])
+def test_a_texture_that_is_no_number_does_not_pass(rng, value):
+    """As in a file that was corrupted: every figure would be NaN, and no NaN is above a bound."""
+    noise = white(20, 400, rng)
+    texture = noise.copy()
+    texture[len(noise) // 2] = value
+    summary = make_play(texture, noise).summary()
+    assert summary["verdict"] == "failed"
+    assert "the texture, is not finite, or beyond 1000 m, in 1 windows" in summary["reason"]
+    json.dumps(summary, allow_nan=False)
+
+
 def test_h2_on_white_noise_fails(rng):
     """Today's: eight carriers play a quarter of white noise, with amplitudes that are right band by band."""
     texture = hr.Recorded(samples=white(20, 400, rng), rate=RATE, gain=1.0, carriers=8)

@@ -151,7 +151,10 @@ def _verdict(recording: Recording, worst: dict[str, Any]) -> tuple[str, str]:
     header, found = recording.header, recording.waveform
     if header.motion_source != "unknown" and found["lost_windows"]:
         bound = f"not finite, or beyond {RUNAWAY:g} {header.unit},"
-        return "failed", f"the motion is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
+        return (
+            "failed",
+            f"the motion, or the texture, is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms",
+        )
     unjudged = _unjudged(recording, worst)
     if not unjudged and worst["value"] > worst["bound"]:
         return "failed", _stopped(recording)

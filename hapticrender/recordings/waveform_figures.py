@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -127,8 +126,9 @@ def _scales(header: Header) -> tuple[Array, Array]:
 def _signals(recording: Recording, start: int, stop: int) -> Array:
     """Reference, and error at every place relative to its share of the target, shape (n, 1 + places)."""
     shares, scales = _scales(recording.header)
-    reference, motion = recording.read("reference", start, stop), recording.read("motion", start, stop)
-    motion = np.where(np.abs(motion) < RUNAWAY, motion, np.nan)
+    names = "reference", "motion"
+    values = (np.asarray(recording.read(name, start, stop)) for name in names)
+    reference, motion = (np.where(np.abs(each) < RUNAWAY, each, np.nan) for each in values)
     landed = np.zeros(len(motion), bool)
     if recording.header.unit == "N":
         landing = min(round(LANDING * recording.rate), start)
@@ -268,10 +268,18 @@ def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> d
 def _contacts(recording: Recording, begin: int, stop: int, rms: float) -> dict[str, Any]:
     """Count of touches and lifts, and the error after them over the reference's `rms`, at the worst place."""
     edges = [round(seconds * recording.rate) for seconds in AFTER_CONTACT]
-    after = [_filtered(recording, at, at + edges[-1]) for at in _events(recording, begin, stop - edges[-1])]
-    squares = [[(values[a:b, 1:] ** 2).mean(axis=0) for a, b in pairwise(edges)] for values in after]
-    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / rms).tolist() if squares else [None, None]
-    return {"count": len(after), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
+    events, squares = np.array(list(_events(recording, begin, stop - edges[-1])), int), []
+    for start in range(begin, stop, READ_AT_ONCE):
+        here = events[(events >= start) & (events < start + READ_AT_ONCE)]
+        if here.size:
+            values = _filtered(recording, here[0], here[-1] + edges[-1])[:, 1:]
+            power = np.concatenate([0 * values[:1], np.cumsum(values**2, axis=0)])
+            at = here[:, None] - here[0] + np.array(edges)
+            squares.append(np.diff(power[at], axis=1) / np.diff(edges)[:, None])
+    errors = [None, None]
+    if squares:
+        errors = (np.sqrt(np.concatenate(squares).mean(axis=0).max(axis=1)) / rms).tolist()
+    return {"count": len(events), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
 
 
 def _events(recording: Recording, begin: int, stop: int) -> Iterator[int]:
