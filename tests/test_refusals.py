@@ -283,6 +283,12 @@ PLANTS = [
 SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
     (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
+    (lambda: limited("vt-plate", peak_drive=2000.0), r"peak_drive = 2000 A: must be <= 3 A, the largest drive of"),
+    (lambda: limited("ultrasonic", rms_drive=500.0), r"rms_drive = 500 V: must be <= .* V, the largest drive of"),
+    (
+        lambda: limited("vt-plate", displacement=400.0),
+        r"displacement = 400 m: must be <= 0.001 m, the sensors' range of",
+    ),
     (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
     (lambda: limited("vt-plate", peak=1), "limits.peak = 1: unknown key; known: displacement, peak_drive, rms_drive"),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
