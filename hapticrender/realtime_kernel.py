@@ -53,7 +53,7 @@ ENTRY = np.dtype(
     ]
 )
 ENTRY_T = numba.from_dtype(ENTRY)
-MIDDLE_AT = ENTRY.fields["middle"][1] if ENTRY.fields else 0
+MIDDLE_AT, SAMPLES_AT = (ENTRY.fields[name][1] if ENTRY.fields else 0 for name in ("middle", "samples"))
 COPIES = 8  # of entry and slot, one a block
 ENTRY_WORDS, WORDS = ENTRY.itemsize // 8, (ENTRY.itemsize + SLOT.itemsize) // 8
 
@@ -315,7 +315,7 @@ def advance(entry):
     raised = stop(entry)
     write_log(entry, slot)
     e.flags |= raised
-    e.samples += e.block
+    swap(entry + SAMPLES_AT, e.samples + e.block)  # the log's rows are there for whoever reads the count
     keep(entry, slot)
     return raised
 

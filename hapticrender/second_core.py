@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-PATIENCE = 60.0  # s that a child may take
+TIMEOUT = 60.0  # s that a child may take
 EXPECTED: set[tuple[str, str]] = set()  # module and name
 CHILDREN: dict[tuple[str, str], Any] = {}  # those that a child process compiles, and the process
 CODE = """
@@ -39,7 +39,7 @@ def await_child(function: Callable[..., Any]) -> None:
     name = (function.__module__, function.__name__)
     EXPECTED.discard(name)
     if child := CHILDREN.pop(name, None):
-        end(child, PATIENCE)
+        end(child, TIMEOUT)
 
 
 def start_child() -> None:
@@ -61,12 +61,12 @@ def start_child() -> None:
         atexit.register(end, child, 0.0)
 
 
-def end(child: Any, patience: float) -> None:
+def end(child: Any, timeout: float) -> None:
     """Wait for a child process, and kill it where it takes too long."""
     import subprocess
 
     try:
-        child.wait(patience)
+        child.wait(timeout)
     except subprocess.TimeoutExpired:
         child.kill()
         child.wait()

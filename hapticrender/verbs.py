@@ -17,7 +17,9 @@ from hapticrender.cli import fail
 from hapticrender.devices import SIMULATED, imported, naming_driver, open_driver, registered
 from hapticrender.devices import text as devices_text
 from hapticrender.errors import naming
+from hapticrender.export import export as export_design
 from hapticrender.formatting import closed_pipes, printable, table
+from hapticrender.latency import measure_latency, write_delay
 from hapticrender.loop import prepare
 from hapticrender.player import Player
 from hapticrender.protocols import Rendering
@@ -297,8 +299,6 @@ def finger(arguments: argparse.Namespace) -> int:
 
 def latency(arguments: argparse.Namespace) -> int:
     """Measure the delay of a loop through a cable, or say where it is stated."""
-    from hapticrender.latency import measure_latency, write_delay
-
     if arguments.out:
         outputs.check_file("--out", arguments.out)
     driver: Any = open_driver(arguments.driver)
@@ -319,12 +319,10 @@ def latency(arguments: argparse.Namespace) -> int:
 
 def export(arguments: argparse.Namespace) -> int:
     """Write a scene's controller as C sources."""
-    from hapticrender.export import export
-
     outputs.check_folder("--out", arguments.out)
     scene = _scene(arguments.scene)
     with naming(arguments.scene):
-        written = export(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
+        written = export_design(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
     folder = shlex.quote(str(arguments.out))
     print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {folder}")
     return 0

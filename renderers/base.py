@@ -22,6 +22,19 @@ Waveform = Callable[[Array, Array], Array]
 Setup = Any  # what `read` returns: a class of each renderer's own
 
 
+def check_limits(limits: Limits, drive: float, unit: str, sensed: float = math.inf) -> None:
+    """Refuse a limit that a device of such a largest `drive` (`unit`) and `sensed` range (m) cannot pass.
+
+    It would guard nothing, and is mostly stated in another unit.
+    """
+    largest = drive, unit, "the largest drive"
+    sensors = sensed, "m", "the sensors' range"
+    for name, (most, of, whose) in {"peak_drive": largest, "rms_drive": largest, "displacement": sensors}.items():
+        if (stated := getattr(limits, name) or 0.0) > most:
+            bound = f"must be <= {most:g} {of}, {whose} of the device, or left out"
+            raise ValueError(f"[limits] {name} = {stated:g} {of}: {bound}")
+
+
 class BaseRenderer:
     """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
@@ -84,7 +97,8 @@ class BaseRenderer:
         raise NotImplementedError
 
     def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
-        """Return the device model with the limits of the device, whose drive is that of `model`."""
+        """Return the device model with the limits of the device, whose drive is that of `model`; see `check_limits`."""
+        check_limits(limits, model.drive_limit, model.drive_unit, model.sensed_limit if model.unit == "m" else math.inf)
         infinite = {name: getattr(limits, name) or math.inf for name in ("peak_drive", "rms_drive", "displacement")}
         peak, step = infinite["peak_drive"], model.drive_step
         if step > 0.0 and peak < model.drive_limit:

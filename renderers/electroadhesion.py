@@ -57,7 +57,7 @@ class ScreenSetup(FrictionSetup):
         limit, unit = assumed.voltage_limit, "V"
         if assumed.drive_kind == "current":
             limit, unit = min(assumed.current_limit, limit / abs(assumed.impedance(load))), "A"
-        limit = min(limit, carrier_limit(self.scene.device_profile.limits))
+        limit = carrier_limit(self.scene.device_profile.limits, limit, unit)
         gain = self.open_loop_gain / assumed.gain(load) * float(assumed.attraction(1.0, load))
         most = gain * limit**2
         swing = settings.headroom * self.needed(self.model(Port(assumed.rate, 1, 1))).drive

@@ -15,7 +15,7 @@ from hapticrender.checks import Validated, checked, flag, option, parameter, req
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.protocols import Array, Driver, Texture
-from hapticrender.renderers.base import BaseRenderer, Waveform
+from hapticrender.renderers.base import BaseRenderer, Waveform, check_limits
 from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed
 from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
@@ -181,9 +181,10 @@ class FrictionSetup:
         return replace(model, mass=mass, damping=damping, contact_damping=0.0, contact_lag=contact, inferred=True)
 
 
-def carrier_limit(limits: Limits) -> float:
-    """Largest peak (drive unit) of a carrier within the limits of peak and rms drive; the rms is that of a sine."""
-    return min(limits.peak_drive or np.inf, np.sqrt(2.0) * (limits.rms_drive or np.inf))
+def carrier_limit(limits: Limits, most: float, unit: str) -> float:
+    """Largest peak of a carrier, `most` (`unit`) or within the limits of peak and rms drive, of a sine."""
+    check_limits(limits, most, unit)
+    return min(most, limits.peak_drive or np.inf, np.sqrt(2.0) * (limits.rms_drive or np.inf))
 
 
 class FrictionRenderer(BaseRenderer):

@@ -161,18 +161,22 @@ def _need_of_waveform(
     scene: Scene, model: DeviceModel, bands: Bands, waveform: Waveform, per_target: Callable[[Array], Array], top: float
 ) -> Need:
     """A target waveform up to `top` (Hz), 0.1 % of the energy left out at either side."""
-    from scipy.signal import lfilter  # only waveforms need it, and its import takes a second
+    from scipy.fft import next_fast_len  # only waveforms need them, and their import takes a second
+    from scipy.signal import lfilter
 
     time = np.arange(int(min(scene.duration, LOOK_AHEAD) * model.rate) + 2) / model.rate
     target = bands.checked(type(scene.texture).__name__, waveform, time, scene.finger.position(time))
     played = target if bands.differentiated else _faded(target, model.rate)
-    frequency = np.fft.rfftfreq(len(played), 1.0 / model.rate)
+    size = len(played) if bands.differentiated else next_fast_len(len(played), real=True)  # a faded one ends at zero
+    frequency = np.fft.rfftfreq(size, 1.0 / model.rate)
     kept = (frequency >= model.lowest_frequency / 2) & (frequency <= top)
     turn = 2j * np.pi * frequency if bands.differentiated else 1.0
-    spectrum = np.where(kept, turn * np.fft.rfft(played), 0.0)
+    spectrum = np.where(kept, turn * np.fft.rfft(played, size), 0.0)
     if bands.differentiated:
-        target = np.fft.irfft(spectrum, len(time))
-    drive = np.fft.irfft(spectrum * share_driven(model, frequency) * per_target(frequency), len(played))
+        target = np.fft.irfft(spectrum, size)
+    driven = spectrum.copy()
+    driven[kept] *= share_driven(model, frequency[kept]) * per_target(frequency[kept])
+    drive = np.fft.irfft(driven, size)
     pole = -math.expm1(-1.0 / (model.rate * scene.device_profile.limits.rms_time))
     rms = math.sqrt(lfilter([pole], [1.0, pole - 1.0], drive**2).max())
     amplitude = float(abs(target).max())

@@ -56,7 +56,7 @@ class UltrasonicRenderer(FrictionRenderer):
         with inside("render"):
             settings = FrictionSettings(**scene.rendering)
         assumed, simulated = read_devices(scene, SurfaceParameters, LEVEL)
-        limit = min(assumed.mode.drive_limit, carrier_limit(scene.device_profile.limits))
+        limit = carrier_limit(scene.device_profile.limits, assumed.mode.drive_limit, "V")
         assumed = replace(assumed, mode=replace(assumed.mode, drive_limit=limit))
         return SurfaceSetup(scene, settings, assumed, simulated)
 

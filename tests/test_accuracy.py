@@ -18,6 +18,7 @@ from hapticrender.touch.mechanics import FingerMechanics
 MISSES = {  # bounds that the default method misses: each is in README's table, or within its last digit there
     "white wrong": {"slide, end"},
     "comb": {"first"},
+    "comb bent": {"first"},
     "sweeps": {"400 Hz/s"},
     "touch 10 um": {"centre", "end"},
 }

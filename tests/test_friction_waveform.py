@@ -119,7 +119,7 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound):
     """True friction is the law's, of the true amplitude; what the recording infers is within a point of it.
 
-    Where the true friction is half as large again, half of the texture is wrong, and not judged.
+    Were the true friction half as large again, the recording would be the same: it is not judged.
     """
     finger = hr.Finger.sliding(speed=speed, normal_load=0.4, span=0.18)
     device = watched(finger)
@@ -134,10 +134,9 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     late = slice(round(0.2 * recording.rate), round(0.55 * recording.rate))
     signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
     true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
-    right, shown, wrong = (np.std(each - reference) / np.std(reference) for each in (true, inferred, 1.5 * true))
+    right, shown = (np.std(each - reference) / np.std(reference) for each in (true, inferred))
     assert right < bound
     assert abs(right - shown) < 0.01
-    assert wrong == pytest.approx(0.5, abs=2 * bound)  # half of a texture that is right within the bound
     summary = recording.summary()
     assert summary["verdict"] == "not judged"
     assert "inferred by a law that is assumed" in summary["reason"]

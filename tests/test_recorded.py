@@ -242,7 +242,7 @@ def test_what_is_no_swipe_is_refused(tmp_path):
 
 @pytest.mark.parametrize(("components", "seed"), [(1, 0), (3, 0), (8, 1), (8, 2**32 - 1)])
 def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
-    texture = Synthetic(amplitude=10e-6, components=components, seed=seed)
+    texture = Synthetic(amplitude=10e-6, components=components, seed=seed, carriers=components)
     frequency = texture.bands(5000.0).frequency
     assert len(frequency) == components
     assert np.diff(frequency, prepend=-10.0).min() >= 40.0 - 1e-9

@@ -150,7 +150,7 @@ SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_dam
 MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
 SCREEN = friction_tone(100.0)
-BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08), "finger": SLIDE}
+BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08, carriers=6), "finger": SLIDE}
 STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
 TO_CARRIER, SLOW = ("electroadhesion", {"output": "carrier"}), {"rate": 79_999, "sensed_channels": 0}
@@ -283,6 +283,12 @@ PLANTS = [
 SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
     (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
+    (lambda: limited("vt-plate", peak_drive=2000.0), r"peak_drive = 2000 A: must be <= 3 A, the largest drive of"),
+    (lambda: limited("ultrasonic", rms_drive=500.0), r"rms_drive = 500 V: must be <= .* V, the largest drive of"),
+    (
+        lambda: limited("vt-plate", displacement=400.0),
+        r"displacement = 400 m: must be <= 0.001 m, the sensors' range of",
+    ),
     (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
     (lambda: limited("vt-plate", peak=1), "limits.peak = 1: unknown key; known: displacement, peak_drive, rms_drive"),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
@@ -312,7 +318,7 @@ SCENES = [
     (lambda: rendered(Own(lambda time, x: time[:-1])), r"Own.waveform returned float64 of shape \(\d+,\): must be"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
     (lambda: opened("hybrid", current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
-    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5)), "a recording over time is not supported"),
+    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5, carriers=6)), "a recording over time is not supported"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]
 DRIVERS = [

@@ -174,6 +174,7 @@ def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
     ("content", "message"),
     [
         (b"duration = \n", r"must be TOML \(Invalid value \(at line 1"),
+        (b'device = "plate.toml"\n[device]\nmass = 0.1\n', r"must be TOML \(.*\): a key is there .* as a table\)"),
         (b"\xff\xfe\x00", r"byte 0: must be UTF-8 text"),
         (b"a = " + b"[" * 5000, r"must be TOML \("),
         (

@@ -35,7 +35,7 @@ print("child", child.returncode)
 
 two_cores = pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core: there is no child")
 AT_ONCE = "jit.ANNOUNCED_AFTER = 0.0; "  # a single function may take less than a second
-ENDLESS = AT_ONCE + "second_core.CODE, second_core.PATIENCE = 'while True: pass', 0.0"
+ENDLESS = AT_ONCE + "second_core.CODE, second_core.TIMEOUT = 'while True: pass', 0.0"
 
 
 def lines_of(script, cache, change=""):

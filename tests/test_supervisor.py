@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from other_plate import REACH, TRUTH, OtherPlate
+from strangers_plate import StrangersPlate
 
 import hapticrender as hr
 from benchmarks import faults
@@ -245,6 +246,23 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
     assert abs(recording.drive[-1000:]).max() < 0.2
     motion = recording.motion[-1000:, 0]
     assert np.ptp(motion) / 2 == pytest.approx(50e-6, rel=0.1)
+
+
+@pytest.mark.parametrize("frequency", [700.0, 1900.0])
+def test_the_default_damper_that_rings_on_a_strangers_plate_is_turned_down(frequency):
+    """Once a finger touches, by a bending mode that nothing states; unsupervised at the limit of the drive for good."""
+    mode = PlateParameters(bending_frequency=frequency, bending_damping=0.01, bending_coil=0.1)
+    ends = []
+    for supervised in (True, False):
+        plate = StrangersPlate.of(mode, TOUCH, seed=1)
+        rendering = hr.prepare(scene(72.0, 50e-6, 2.0, finger=TOUCH, rendering={"probe": False}), driver=plate)
+        bare = replace(rendering, controller=lambda rendering=rendering: rendering.controller().controller)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", hr.PlateMismatch)
+            drive = hr.run(rendering if supervised else bare).drive
+        ends.append(abs(drive[-1000:]).max() / rendering.model.drive_limit)
+    assert ends[0] < 0.2
+    assert ends[1] > 0.95
 
 
 @pytest.mark.parametrize("seed", [*range(1000, 1006), 10041, 10099, 41691, 60789, 61279])

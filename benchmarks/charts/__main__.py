@@ -51,10 +51,10 @@ def draw_devices(out: Path) -> None:
     _write(out / "device-chart", draw.devices(points, swept), _as_data(points, swept))
 
 
-def draw_stability(_: Path) -> None:
-    """Stability of every method, picture and data into out/charts."""
+def draw_stability(out: Path) -> None:
+    """Stability of every method."""
     rows, dampers = stability.measure(), [damper_map(case) for case in stability.CASES]
-    stability.draw(rows, dampers).savefig(_data() / "stability.png", dpi=90)
+    stability.draw(rows, dampers).savefig(out / "stability.png", dpi=70)
     for case, each in zip(stability.CASES, dampers, strict=True):
         held, margin = stability.limits(each)
         print(f"  inverse, {case.title}: ".replace("\n", " ") + f"stable to {held:g} samples, margin {margin:.2f}")

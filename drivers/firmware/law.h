@@ -83,7 +83,7 @@ typedef struct {
     uint32_t hold;                             /* samples */
     /* learning */
     uint32_t learning_delay, relearning_delay, initial_end, report_delay, loss_time; /* samples */
-    real_t noise[2], model_error, levelling_pole;         /* m^2; part of the deviation's power; a sample */
+    real_t noise[2], model_error, levelling_pole;         /* m^2; sigma_e^2's share of mean dev_u^2; a sample */
     real_t prior[LAW_PARAMETERS], reversion[LAW_PARAMETERS], initial_variance[4]; /* means; 1 - a_i */
     real_t prior_covariance[LAW_PARAMETERS][LAW_PARAMETERS];
 } design_t;

@@ -14,6 +14,7 @@ from itertools import product
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from hapticrender.accuracy.signals import Modulated, Path, chirp, clicks, pink, sliding, white
 from hapticrender.control.methods import method_named
@@ -55,8 +56,6 @@ class Run(NamedTuple):
 
     def in_band(self) -> tuple[Array, Array]:
         """Reference (n,) and error under the finger and at both ends (n, 3), m, 20 to 500 Hz."""
-        from scipy.signal import butter, sosfiltfilt
-
         sos = butter(4, [20.0, 500.0], "bandpass", fs=1 / self.time[1], output="sos")
         error = self.truth[:, EVERY] - self.reference[:, None]
         return sosfiltfilt(sos, self.reference), sosfiltfilt(sos, error, axis=0)
@@ -403,7 +402,9 @@ CASES: dict[str, Case] = {
     "tones bent": tones,
     "tones wrong": lambda bench: tones(bench.of(**WRONG | RIGID)),
     "comb": lambda bench: comb(bench.of(**RIGID)),
+    "comb bent": comb,
     "sweeps": lambda bench: sweeps(bench.of(**RIGID)),
+    "sweeps bent": sweeps,
     "touch": touch,
     "touch rigid": lambda bench: touch(bench.of(**RIGID)),
     "touch wrong": lambda bench: worst_touch(bench.of(**WRONG | RIGID)),

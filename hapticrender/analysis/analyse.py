@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from hapticrender.analysis.course import Course, MotionFilter, Rest, Signals, at_least, sensor_noise
 from hapticrender.analysis.lock_in import Lines, demodulate, tile, window_length
@@ -17,6 +18,7 @@ from hapticrender.checks import require
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.recording import Recording
+from hapticrender.touch.curve import strongest_carriers
 from hapticrender.touch.device_profile import DeviceProfile
 
 WIDE = 0.25e-3  # s: spread of the kernel under the carriers; 0.8 of 400 Hz passes
@@ -111,8 +113,6 @@ def analyse_finger(
 
 def _spoiled(recording: Recording) -> Array:
     """Samples (bool, (n,)) within `AROUND` of one that is lost, no number, or of two fingers."""
-    from scipy.ndimage import maximum_filter1d
-
     bad = (recording.flags & int(Flag.OVERRUN | Flag.NONFINITE | Flag.TWO_TOUCHES)) > 0
     return np.asarray(maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * recording.rate) + 1) > 0)
 
@@ -158,8 +158,6 @@ def _carriers(bands: Bands, sensed: Array, rate: float) -> Array:
     if len(bands):
         fixed = bands.frequency[bands.wavenumber == 0.0]
     else:
-        from hapticrender.touch.curve import strongest_carriers
-
         fixed = strongest_carriers(sensed.mean(axis=1), rate, passband=(SLOWEST, FASTEST * rate))
     return np.unique(fixed[(fixed >= SLOWEST) & (fixed <= FASTEST * rate)])
 
@@ -190,8 +188,6 @@ class _Signals:
 
         What carriers leave of a plate that is far off its profile is not in it.
         """
-        from scipy.ndimage import gaussian_filter1d
-
         theta = course.at(np.arange(len(self.columns)) / self.rate)
         force = Signals.of(self.columns).residual(theta, course.plate.half_spacing)
         return np.asarray(gaussian_filter1d(force[:, 0], spread_of(SLOWEST / 3) * self.rate, mode="nearest"))

@@ -4,6 +4,7 @@ import math
 from statistics import NormalDist
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from hapticrender.analysis.smoothing import History
 from hapticrender.protocols import Array
@@ -61,8 +62,6 @@ class ContactDetector:
         `measured` (n, columns) has the heave force (N) first, `high` (N, (n,)) is its upper threshold; `rest`
         (n, columns) replaces what would be followed.
         """
-        from scipy.ndimage import maximum_filter1d
-
         n = len(measured)
         joined, high = self._measured.before(measured), self._high.before(high)
         ahead = maximum_filter1d(joined[:, 0], self.delay + 1, origin=-((self.delay + 1) // 2))[:n]

@@ -19,6 +19,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.signal import cont2discrete, lfilter, lfilter_zi
+from scipy.special import chdtri
 
 from hapticrender.analysis.lock_in import Lines
 from hapticrender.analysis.records import Impedance, PlateTrack
@@ -85,8 +88,6 @@ def at_least(noise: Array, plate: PlateParameters) -> Array:
 
 def _bending(plate: PlateParameters, rate: float, late: int) -> tuple[Array, Array]:
     """Filter (b, a) from a heave force (N), held over each sample `late` samples later, to the bending of it (m)."""
-    from scipy.signal import cont2discrete
-
     w = 2 * math.pi * plate.bending_frequency
     if not w:
         return np.zeros(2), np.array([1.0, 0.0])
@@ -116,8 +117,6 @@ class MotionFilter:
 
     def update(self, drive: Array, sensed: Array) -> Signals:
         """Signals (n, 2) of the samples `delay` before those of drive (A, (n, coils)) and measurement (m, (n, 2))."""
-        from scipy.signal import lfilter, lfilter_zi
-
         force, coordinates, (b, a) = self.force(drive), sensed @ self.coordinate_from_sensed.T, self._mode
         before = lfilter_zi(b, a) * force[0, 0] if self._bent is None else self._bent
         bent, self._bent = lfilter(b, a, force[:, 0], zi=before)
@@ -231,9 +230,6 @@ class Course:
         The equation error, linear in the parameters, would be biased by the noise in its regressors: the plate hardly
         rocks, so that rocking is mostly noise.  Pintelon & Schoukens, System Identification, 2nd ed. 2012, 9.10.
         """
-        from scipy.optimize import least_squares
-        from scipy.special import chdtri
-
         measured = Signals.of(lines.amplitude)
         prior = np.r_[self.start, self.slope]
         spread = np.sqrt(np.diagonal(self.covariance))

@@ -6,6 +6,7 @@ from math import inf, nan, sqrt
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from scipy.optimize import curve_fit
 
 from hapticrender.analysis.records import FingerRecord, Impedance
 from hapticrender.checks import require
@@ -124,8 +125,6 @@ def mean_exponent(laws: Sequence[LoadLaw], frequency: Array) -> tuple[Array, Arr
 
 def _power(samples: Samples) -> tuple[float, ...]:
     """One row of `LoadLaw` from the samples of a bin."""
-    from scipy.optimize import curve_fit
-
     logs, sigma = np.log(samples.load), samples.standard_error
     middle, count = float(logs.mean()), len(logs)
     size = np.sqrt(np.maximum(np.abs(samples.value) ** 2 - sigma**2, 0.0))

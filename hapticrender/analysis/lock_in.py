@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import find_objects, label
 
 from hapticrender.protocols import Array
 
@@ -67,8 +68,6 @@ def tile(inside: Array, length: int, before: int, after: int) -> Array:
 
     `before` and `after` samples are left out at the beginning and at the end of a span.
     """
-    from scipy.ndimage import find_objects, label
-
     spans = (span for (span,) in find_objects(label(inside)[0]))
     starts = [np.arange(span.start + before, span.stop - after - length + 1, length) for span in spans]
     return np.concatenate([np.empty(0, int), *starts]).astype(int)

@@ -6,6 +6,8 @@ from math import inf, log, nan, sqrt
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.special import chdtrc, ndtri
 
 from hapticrender.analysis.load_law import APART, Samples, Source, parts_of
 from hapticrender.analysis.records import FingerRecord
@@ -72,14 +74,10 @@ class FingerFit:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi-square if the model and the stated errors are right; below 0.01: they are not."""
-        from scipy.special import chdtrc
-
         return float(chdtrc(self.degrees_of_freedom, self.chi_square)) if self.degrees_of_freedom else nan
 
     def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
         """Confidence interval of a parameter (SI) at a `level` between 0 and 1; not below 0 but for the exponent."""
-        from scipy.special import ndtri
-
         require(name in self.names, "name", name, f"one of {', '.join(self.names)}")
         require(0 < level < 1, "level", level, "> 0 and < 1")
         value, half = self.values[name], float(ndtri(0.5 + level / 2)) * self.standard_errors[name]
@@ -220,8 +218,6 @@ def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> A
 
 def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None = None) -> FingerFit:
     """Fit one order, from several starts where it is the 4th, and the errors of the plates on the way."""
-    from scipy.optimize import least_squares
-
     names, logs = PARTS[: 3 * order // 2], np.log(samples.load)
     fixed = {"order": order, "reference_load": float(np.exp(logs.mean())), "load_exponent": 0.0}
     if samples.loads_differ:

@@ -9,6 +9,7 @@ Kernels end `REACH` spreads from their middle, where g has fallen to 4e-6.
 import math
 
 import numpy as np
+from scipy.signal import oaconvolve
 
 from hapticrender.protocols import Array
 
@@ -62,8 +63,6 @@ class History:
 
 def convolve(signal: Array, taps: Array) -> Array:
     """Convolve a signal (n, ...) with taps (m,) over time, where they overlap wholly: shape (n - m + 1, ...)."""
-    from scipy.signal import oaconvolve
-
     return oaconvolve(signal, taps.reshape(-1, *[1] * (signal.ndim - 1)), mode="valid", axes=0)
 
 

@@ -18,6 +18,7 @@ import math
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from hapticrender.analysis.contact import ContactDetector, clear_sigmas
 from hapticrender.analysis.course import Course, MotionFilter, Rest, Signals, at_least
@@ -155,8 +156,6 @@ class FingerTracker:
 
     def _thresholds(self, signals: Signals) -> Array:
         """Upper threshold (N, (n,)) of contact: noise, and what the plate's uncertainty makes of its motion at most."""
-        from scipy.ndimage import maximum_filter1d
-
         covariance = self.course.covariance_at(max(self._at, 0) / self.rate)
         phi = signals.regressors(self.course.plate.half_spacing)[:, 0]
         variance = self._peak.before(np.einsum("ni,ij,nj->n", phi, covariance, phi))
@@ -166,8 +165,6 @@ class FingerTracker:
 
     def _touch(self, rows: Array, n: int) -> Touch:
         """Fit load and position of n samples to the rows around them."""
-        from scipy.ndimage import minimum_filter1d
-
         edge, line = self._edge, self._line
         loaded = rows[:, 4] > 0.5
         first = edge + line.behind

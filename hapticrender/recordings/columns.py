@@ -14,6 +14,7 @@ from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import h5_arrays, mat_arrays, naming_damage, npz_arrays
 from hapticrender.recordings.journal import Header, join
+from hapticrender.touch.scene import Custom, Scene
 from hapticrender.touch.tribometer import unwrap_counts
 
 METHOD = "recorded elsewhere"
@@ -71,8 +72,6 @@ def assemble(
 
     See ``Recording.from_columns``.
     """
-    from hapticrender.touch.scene import Custom, Scene
-
     source = "columns" if isinstance(columns, Mapping) else Path(columns).name
     table = columns if isinstance(columns, Mapping) else read_columns(columns)
     found = {key: _columns(table, key, each) for key, each in chosen.items() if each is not None}

@@ -14,16 +14,14 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, checked, flag, number, numbers, option, parameter, require, text
 from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.touch.scene import Scene
+from hapticrender.touch.scene import Scene
 
 FORMAT = "hapticrender recording"
 VERSION = 2
@@ -113,7 +111,7 @@ class Header(Validated):
         require(fits, "sensed_noise", self.sensed_noise, "one number, or one a place")
 
     @classmethod
-    def of(cls, scene: "Scene", **rest: Any) -> Self:
+    def of(cls, scene: Scene, **rest: Any) -> Self:
         """Take name, device, duration, tolerance and settling time from a scene, but for what `rest` states."""
         own = {name: getattr(scene, name) for name in ("name", "device", "duration", "tolerance", "settle")}
         return cls(scene=scene.to_toml(), **own | rest)

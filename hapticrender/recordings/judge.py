@@ -144,7 +144,8 @@ def _verdict(recording: Recording, worst: dict[str, Any], misses: bool, noise: f
     header, found = recording.header, recording.waveform
     if header.motion_source != "unknown" and found["lost_windows"]:
         bound = f"not finite, or beyond {RUNAWAY:g} {header.unit},"
-        return "failed", f"the motion is {bound} in {found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
+        lost = f"{found['lost_windows']} windows of {1e3 * WINDOW:g} ms"
+        return "failed", f"the motion, or the texture, is {bound} in {lost}"
     unjudged = _unjudged(recording)
     if not unjudged and not misses and worst["value"] > worst["bound"]:
         unjudged = f"the worst figure is not distinct from the noise of the sensors, {percent(noise)}"

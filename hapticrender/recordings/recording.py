@@ -17,11 +17,11 @@ from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal
 from hapticrender.recordings.journal import Header
+from hapticrender.touch.scene import Scene
 
 if TYPE_CHECKING:
     from hapticrender.recordings.columns import Chosen
     from hapticrender.recordings.envelopes import Envelopes
-    from hapticrender.touch.scene import Scene
 
 
 FLUSH = 0.25  # s of signal: the most that a killed process loses
@@ -211,8 +211,6 @@ class Recording:
     @cached_property
     def scene(self) -> Scene:
         """The scene that was rendered."""
-        from hapticrender.touch.scene import Scene
-
         return Scene.from_toml_text(self.header.scene, where="recording")
 
     method: str = _of_header("method", "Name of the control method.")

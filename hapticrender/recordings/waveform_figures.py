@@ -9,10 +9,10 @@ E = rms_B(e)/rms_B(r) is the larger one by both: spectra hardly see the ends, th
 import math
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, judged_from
@@ -41,6 +41,7 @@ LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst wi
 UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
+LANDING = 3e-3  # s: five memory lengths of a contact at 20 mm/s, in which the friction of a touch builds up
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
@@ -121,19 +122,30 @@ def _scales(header: Header) -> tuple[Array, Array]:
 def _signals(recording: Recording, start: int, stop: int) -> Array:
     """Reference, and error at every place relative to its share of the target, shape (n, 1 + places)."""
     shares, scales = _scales(recording.header)
-    reference, motion = recording.read("reference", start, stop), recording.read("motion", start, stop)
-    motion = np.where(np.abs(motion) < RUNAWAY, motion, np.nan)
+    names = "reference", "motion"
+    values = (np.asarray(recording.read(name, start, stop)) for name in names)
+    reference, motion = (np.where(np.abs(each) < RUNAWAY, each, np.nan) for each in values)
+    landed = np.zeros(len(motion), bool)
     if recording.header.unit == "N":
-        motion = _without_base(motion, np.isfinite(recording.read("position", start, stop)))
-    return np.column_stack([reference, (motion - np.outer(reference, shares)) / scales])
+        landing = min(round(LANDING * recording.rate), start)
+        touching = np.isfinite(recording.read("position", start - landing, stop))
+        felt = np.asarray(sliding_window_view(touching, landing + 1).all(axis=1))
+        motion, landed = _without_base(motion, touching[landing:], felt), touching[landing:] & ~felt
+    error = (motion - np.outer(reference, shares)) / scales
+    error[landed] *= 0.0
+    return np.column_stack([reference, error])
 
 
-def _without_base(friction: Array, touching: Array) -> Array:
-    """Friction (n, places) less its mean over each touch: a touch brings friction of its own, whatever the texture."""
+def _without_base(friction: Array, touching: Array, felt: Array) -> Array:
+    """Friction (n, places) less its mean over each touch, where `felt`: a touch brings friction of its own.
+
+    Without a finger there is none; as that of a touch builds up, nothing else is felt, and nothing is judged.
+    """
     for part in np.split(np.arange(len(touching)), np.flatnonzero(np.diff(touching)) + 1):
-        if part.size:
-            known = np.isfinite(friction[part]).sum(axis=0)  # a lost sample is lost alone
-            friction[part] -= np.nansum(friction[part], axis=0) / np.maximum(known, 1)
+        known = part[felt[part]]
+        count = np.isfinite(friction[known]).sum(axis=0)  # a lost sample is lost alone
+        friction[part] -= np.nansum(friction[known], axis=0) / np.maximum(count, 1)
+    friction[~touching] *= 0.0
     return friction
 
 
@@ -252,10 +264,18 @@ def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> d
 def _contacts(recording: Recording, begin: int, stop: int, rms: float) -> dict[str, Any]:
     """Count of touches and lifts, and the error after them over the reference's `rms`, at the worst place."""
     edges = [round(seconds * recording.rate) for seconds in AFTER_CONTACT]
-    after = [_filtered(recording, at, at + edges[-1]) for at in _events(recording, begin, stop - edges[-1])]
-    squares = [[(values[a:b, 1:] ** 2).mean(axis=0) for a, b in pairwise(edges)] for values in after]
-    errors = (np.sqrt(np.mean(squares, axis=0).max(axis=1)) / rms).tolist() if squares else [None, None]
-    return {"count": len(after), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
+    events, squares = np.array(list(_events(recording, begin, stop - edges[-1])), int), []
+    for start in range(begin, stop, READ_AT_ONCE):
+        here = events[(events >= start) & (events < start + READ_AT_ONCE)]
+        if here.size:
+            values = _filtered(recording, here[0], here[-1] + edges[-1])[:, 1:]
+            power = np.concatenate([0 * values[:1], np.cumsum(values**2, axis=0)])
+            at = here[:, None] - here[0] + np.array(edges)
+            squares.append(np.diff(power[at], axis=1) / np.diff(edges)[:, None])
+    errors = [None, None]
+    if squares:
+        errors = (np.sqrt(np.concatenate(squares).mean(axis=0).max(axis=1)) / rms).tolist()
+    return {"count": len(events), "error_0_50_ms": errors[0], "error_50_200_ms": errors[1]}
 
 
 def _events(recording: Recording, begin: int, stop: int) -> Iterator[int]:

@@ -1,9 +1,8 @@
 """Write one page about many rendered scenes: plain HTML that opens from a file, without script, server or network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 from hapticrender import __version__
@@ -119,6 +118,12 @@ def _section(scene: Outputs, folder: str) -> str:
     if len(summary["bands"]) > _MANY_BANDS:
         bands = f"<details><summary>{escape(bands_label(summary['bands']))}</summary>{bands}</details>"
     notes = "".join(f'<p class="note">{_whole(line)}</p>' for line in (conditions(summary), *remarks(summary)))
+    sounds = "".join(  # a player for each WAV, with its full scale
+        f'<p class="note">{name.removesuffix(".wav").capitalize()}, '
+        f"full scale {short(sound['full_scale'], sound['unit'])}"
+        f'<audio controls preload="none" src="{folder}/{name}"></audio></p>'
+        for name, sound in summary["sound"].items()
+    )
     return f"""<section id="{name}">
 <h2>{name}</h2>
 <p class="{CLASSES[summary["verdict"]]}">{sentence[:1].upper()}{sentence[1:]}.</p>
@@ -126,18 +131,8 @@ def _section(scene: Outputs, folder: str) -> str:
 {_table(waveform_rows(summary))}
 {bands}
 <div class="halves">
-<div>{notes}{_sounds(summary, folder)}
+<div>{notes}{sounds}
 <p class="note">{links}</p></div>
 <pre>{escape(scene.toml.strip())}</pre>
 </div>
 </section>"""
-
-
-def _sounds(summary: Mapping[str, Any], folder: str) -> str:
-    """Make a player for each WAV, with its full scale."""
-    return "".join(
-        f'<p class="note">{name.removesuffix(".wav").capitalize()}, '
-        f"full scale {short(sound['full_scale'], sound['unit'])}"
-        f'<audio controls preload="none" src="{folder}/{name}"></audio></p>'
-        for name, sound in summary["sound"].items()
-    )

@@ -153,12 +153,9 @@ class MotionEstimator:
         position, velocity = np.einsum("ki...,i->k...", rows, self._state)
         spread = np.einsum("ki...,ij,kj...->k...", rows, self._covariance, rows)
         spread += [self._bias + self.density * t**5 / 20.0, self.density * t**3 / 3.0]
-        values = (
-            np.where(gone, np.nan, position),
-            np.where(gone, 0.0, velocity),
-            *np.where(gone, np.nan, np.sqrt(spread)),
-        )
-        return MotionEstimate(*(each[()] for each in values))
+        position, velocity = np.where(gone, np.nan, position), np.where(gone, 0.0, velocity)
+        errors = np.where(gone, np.nan, np.sqrt(spread))
+        return MotionEstimate(*(each[()] for each in (position, velocity, *errors)))
 
     def lift(self) -> None:
         """The finger has left: its position is not known until the next sample."""

@@ -284,7 +284,7 @@ class Synthetic(Validated, Composable):
 
     Examples
     --------
-    >>> Synthetic(amplitude=10e-6, components=3).bands(rate=5000.0).frequency.round(1).tolist()
+    >>> Synthetic(amplitude=10e-6, components=3, carriers=3).bands(rate=5000.0).frequency.round(1).tolist()
     [42.7, 210.4, 380.8]
     """
 
@@ -294,6 +294,7 @@ class Synthetic(Validated, Composable):
     speed: float | None = parameter(None, "m/s", "at which they lie at 30 to 400 Hz", above=1e-6, most=MOST_SPEED)
     components: int = parameter(6, about="how many, at least 40 Hz apart", least=1, most=8)
     seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
+    carriers: int | None = parameter(None, about="of its strongest components; None: played whole", least=1, most=8)
 
     @property
     def spatial(self) -> bool:
@@ -301,8 +302,14 @@ class Synthetic(Validated, Composable):
         return self.speed is not None
 
     def bands(self, rate: float) -> Bands:
-        """Carriers at the components (below rate/2, `rate` in Hz); envelopes are to be analysed."""
-        return _carriers(_draw(self.components, self.seed)[0], self.speed, rate)
+        """Carriers at the strongest components (below rate/2, `rate` in Hz); envelopes are to be analysed.
+
+        None without `carriers`: the whole waveform is played.
+        """
+        if self.carriers is None:
+            return Bands.none(spatial=self.spatial)
+        frequency, weight = _draw(self.components, self.seed)[:2]
+        return _carriers(frequency[np.sort(np.argsort(-weight)[: self.carriers])], self.speed, rate)
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""

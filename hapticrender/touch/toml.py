@@ -34,7 +34,8 @@ def loads(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as problem:
-        raise ValueError(f"must be TOML ({' '.join(str(problem).split())[:200]})") from problem
+        twice = ": a key is there twice, or as a value and as a table" if "overwrite" in str(problem) else ""
+        raise ValueError(f"must be TOML ({' '.join(str(problem).split())[:200]}{twice})") from problem
 
 
 def dumps(table: Mapping[str, Any]) -> str:

@@ -76,10 +76,9 @@ def _load_swipe(file: str, changed: int) -> SwipeRecording:
     from scipy.ndimage import find_objects, label
 
     raw = _read(file)
-    rate, metre_per_count = (
-        checks.number(key, raw[key].item() if raw[key].size == 1 else raw[key], unit, above=0, most=most)
-        for key, unit, most in (("rate", "Hz", 1e6), ("metre_per_count", "m", 1e-3))
-    )
+    single = {key: raw[key].item() if raw[key].size == 1 else raw[key] for key in ("rate", "metre_per_count")}
+    rate = checks.number("rate", single["rate"], "Hz", above=0, most=1e6)
+    metre_per_count = checks.number("metre_per_count", single["metre_per_count"], "m", above=0, most=1e-3)
     lateral, normal = (_row(raw, key, "iuf", "numbers in N").astype(float) for key in ("lateral_force", "normal_force"))
     position = unwrap_counts(_row(raw, "encoder", "iu", "integer counts").astype(np.uint32)) * metre_per_count
     if not position.size == lateral.size == normal.size > UNLOADED * rate + 1:
