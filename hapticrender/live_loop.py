@@ -19,7 +19,7 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import device_fault, motion_of_sensors, samples_late, stops_itself
+from hapticrender.loop import CHUNK, device_fault, differences, motion_of_sensors, samples_late, stops_itself
 from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
@@ -259,6 +259,13 @@ class LiveLoop(RealtimeEntry):
         """What every band did over the last `JUDGED` seconds, see `band_figures`."""
         first, signals = self.signals(self.samples - round(JUDGED * self.driver.rate))
         return band_figures(self.rendering.bands, first, self.driver.rate, signals)
+
+    def differences(self) -> tuple[str, ...]:
+        """State where the device differs at the moment from the model of the controller that runs, unless stopped."""
+        if self.stopped is not None:
+            return ()
+        _, last = self.signals(self.samples - round(CHUNK * self.driver.rate))
+        return differences(self.rendering, self.running, last)
 
     def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
