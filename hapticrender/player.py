@@ -150,7 +150,8 @@ class Player(Addressed):
                 last.push(self._stack.pop_all())
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
-            found = () if self._error or isinstance(error, Exception) else getattr(self._loop, "differences", tuple)()
+            failed = self._error is not None or isinstance(error, Exception)  # which Ctrl-C is not
+            found: tuple[str, ...] = () if failed else getattr(self._loop, "differences", tuple)()  # while it plays
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
@@ -344,8 +345,7 @@ class Player(Addressed):
         driver: Any = self._driver
         if isinstance(driver, str):
             driver = open_driver(driver, scenes[0].device_profile)
-        if hasattr(driver, "live"):
-            driver = driver.live()
+        driver = driver.live() if hasattr(driver, "live") else driver
         try:
             return self._start(prepare(scenes[0], driver=driver), scenes[1:])
         except BaseException:

@@ -10,6 +10,7 @@ import hapticrender as hr
 from hapticrender import cli
 from hapticrender.errors import SceneError
 from hapticrender.recordings.recording import Recording
+from hapticrender.touch.mechanics import HEAVY_SECOND
 from hapticrender.touch.scene import Scene
 
 PLATE = {
@@ -187,14 +188,21 @@ def test_live_play_that_ctrl_c_ends_names_it_too(plate):
         stop(player)
 
 
-def test_an_inner_damper_that_was_turned_down_live_is_named():
-    """A bending mode at 900 Hz that the model lacks, under a finger; see `tests/test_supervisor.py`."""
+@pytest.mark.parametrize(("device", "frequency"), [("vt-plate", 72.0), ("hybrid", 50.0)])
+def test_an_inner_damper_that_was_turned_down_is_named(device, frequency):
+    """Live and by `render`: a bending mode at 900 Hz that the model lacks; see `tests/test_supervisor.py`."""
     bent = {"bending_frequency": 900.0, "bending_coil": -0.1}
-    named = pytest.warns(hr.PlateMismatch, match="inner damper rang above 500 Hz and was turned down to 0")
-    with named, hr.Player(paced=False, method="h2", simulation=bent) as player:
+    fields = {"method": "h2", "simulation": bent}
+    texture = hr.Grating(frequency=frequency, amplitude=50e-6)
+    message = "inner damper rang above 500 Hz and was turned down to 0"
+    named = pytest.warns(hr.PlateMismatch, match=message)
+    with named, hr.Player(device, paced=False, **fields) as player:
         player.finger(0.0, 0.0, 0.8)
-        player.play(hr.Grating(frequency=72.0, amplitude=50e-6))
+        player.play(texture)
         player.sleep(2.0)
+    finger = hr.Finger.still(normal_load=0.8, touches=((0.5, 5.0),), mechanics=HEAVY_SECOND)
+    with pytest.warns(hr.PlateMismatch, match=message):
+        hr.render(hr.Scene(texture=texture, finger=finger, duration=2.0, device=device, **fields))
 
 
 def fields(plate):
