@@ -163,7 +163,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
     start = max(len(recording) - round(CHUNK * recording.rate), 0)
     last = {name: recording.read(name, start) for name in ("position", "drive", "sensed")}
-    recording.warnings = differences(rendering, loop.controller, last)
+    recording.warnings = differences(rendering, *departure(loop.controller), last)
     warn_of(recording.warnings, recording)
     return recording
 
@@ -403,16 +403,19 @@ class _Loop:
         return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
 
 
-def differences(rendering: Rendering, controller: Controller, last: dict[str, Array]) -> tuple[str, ...]:
-    """State where the device differs from the model of the controller; `last`: signals of the last `CHUNK` seconds."""
-    scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
-    messages = []
+def departure(controller: Controller) -> tuple[float, float]:
+    """Gain to which an inner damper was turned down, and share that a controller adds to what its model asks for."""
+    return getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
+
+
+def differences(rendering: Rendering, scale: float, mismatch: float, last: dict[str, Array]) -> tuple[str, ...]:
+    """State by its `departure` where the device differs from a model; `last`: signals of the last `CHUNK` seconds."""
+    source, messages = rendering.scene.source, []
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
         message += "the sensors' noise where there is none"
         message += f", which profile {source} lacks" if source else ""
         messages.append(message)
-    mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch > MISMATCH:
         messages.append(_mismatch(rendering, last, mismatch))
     return tuple(messages)

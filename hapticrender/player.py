@@ -151,12 +151,12 @@ class Player(Addressed):
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
             failed = self._error is not None or isinstance(error, Exception)  # which Ctrl-C is not
-            found: tuple[str, ...] = () if failed else getattr(self._loop, "differences", tuple)()  # while it plays
+            compared = getattr(None if failed else self._loop, "compare", lambda: tuple)()  # while it plays
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
             raise HapticError(slow)
-        warn_of(found)
+        warn_of(compared())
 
     @property
     def time(self) -> float:
@@ -264,7 +264,7 @@ class Player(Addressed):
             if self._unwritten is not None:
                 raise self._unwritten
             recording = recorder.finish()
-            recording.warnings = getattr(self._loop, "differences", tuple)()
+            recording.warnings = getattr(self._loop, "compare", lambda: tuple)()()
             return recording
 
     def state(self) -> PlayerState:
