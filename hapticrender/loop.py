@@ -161,7 +161,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             raise fault
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
-    _compare(rendering, loop.controller, recording)
+    start = max(len(recording) - round(CHUNK * recording.rate), 0)
+    last = {name: recording.read(name, start) for name in ("position", "drive", "sensed")}
+    recording.warnings = differences(rendering, *departure(loop.controller), last)
+    warn_of(recording.warnings, recording)
     return recording
 
 
@@ -400,50 +403,56 @@ class _Loop:
         return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
 
 
-def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
-    """Warn where the device differs from the model that the controller was designed for."""
-    scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
-    messages = []
-    profile = f", profile {source}" if source else ""
+def departure(controller: Controller) -> tuple[float, float]:
+    """Gain to which an inner damper was turned down, and share that a controller adds to what its model asks for."""
+    return getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
+
+
+def differences(rendering: Rendering, scale: float, mismatch: float, last: dict[str, Array]) -> tuple[str, ...]:
+    """State by its `departure` where the device differs from a model; `last`: signals of the last `CHUNK` seconds."""
+    source, messages = rendering.scene.source, []
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
         message += "the sensors' noise where there is none"
         message += f", which profile {source} lacks" if source else ""
         messages.append(message)
-    mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch > MISMATCH:
-        messages.append(_mismatch(rendering, recording, mismatch, profile))
-    recording.warnings = tuple(messages)
+        messages.append(_mismatch(rendering, last, mismatch))
+    return tuple(messages)
+
+
+def warn_of(messages: tuple[str, ...], recording: Recording | None = None) -> None:
+    """Warn of `differences`, in the name of the caller's caller; as an error it must not lose what was played."""
     for message in messages:
         try:
             warnings.warn(message, PlateMismatch, stacklevel=3)
-        except PlateMismatch as error:  # as an error it must not lose what was played
+        except PlateMismatch as error:
             error.recording = recording
             raise
 
 
-def _mismatch(rendering: Rendering, recording: Recording, mismatch: float, profile: str) -> str:
+def _mismatch(rendering: Rendering, last: dict[str, Array], mismatch: float) -> str:
     """State by how much the device differs from its model, at which frequencies, and what to do."""
-    errors = _stiffness_errors(rendering, recording)
+    errors, source = _stiffness_errors(rendering, last), rendering.scene.source
     found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
     cure = "correct [device]"
     if rendering.scene.device == "vt-plate":
         cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
     return (
-        f"the device differs from its model{profile}: the controller adds {100 * mismatch:.1f} % to what that asks for "
-        f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
+        f"the device differs from its model{f', profile {source}' if source else ''}: the controller adds "
+        f"{100 * mismatch:.1f} % to what that asks for (bound {100 * MISMATCH:g} %)"
+        f"{f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
     )
 
 
-def _stiffness_errors(rendering: Rendering, recording: Recording) -> list[tuple[float, float]]:
+def _stiffness_errors(rendering: Rendering, last: dict[str, Array]) -> list[tuple[float, float]]:
     """Relative error of the model's dynamic stiffness |D_11| at every fixed carrier (Hz), without a finger.
 
-    Least squares of all carriers over the last `CHUNK` seconds; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
+    Least squares of all carriers over the `last` signals; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
     """
     model, bands = rendering.model, rendering.bands
     hertz = np.unique(bands.frequency[(bands.wavenumber == 0.0) & (bands.frequency > 0.0)])
-    start = max(len(recording) - round(CHUNK * recording.rate), 0)
-    position, drive, sensed = (recording.read(name, start) for name in ("position", "drive", "sensed"))
+    position, drive, sensed = (last[name] for name in ("position", "drive", "sensed"))
     if not hertz.size or np.isfinite(position).any() or len(drive) < 8 * len(hertz):
         return []
     phase = 2 * np.pi / model.rate * np.multiply.outer(np.arange(len(drive)), hertz)
