@@ -116,6 +116,11 @@ class AudioDriver(BaseDriver):
         """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
         return (1 + self._ahead) * self.block
 
+    @property
+    def host_delay(self) -> int:
+        """Samples of `delay` that the card itself does not have: `queued`, of a driver for `play`; else 0."""
+        return self.delay - (self.play_delay - self.queued)
+
     def live(self) -> AudioDriver:
         """Make the same driver for a compiled controller: its `delay` is the card's, `play_delay` is that of `play`."""
         driver = copy.copy(self)

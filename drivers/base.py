@@ -27,6 +27,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     of an open device with a controller of its own: the same, playing the drive of the host, in a `with` statement
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
+``host_delay`` (optional)
+    samples of `delay` that the device itself does not have, only a drive that the host computes: a profile is without
 ``finger`` (optional)
     of a device that takes the finger's position from the host: None, until `render` sets it to the scene's `Finger`
 ``rendering``, ``device_kind`` (optional)
