@@ -108,7 +108,7 @@ from typing import Self
 import numpy as np
 
 from hapticrender.driver_checks import check_driver as check_driver
-from hapticrender.errors import DriverError
+from hapticrender.errors import DriverError, noted_on
 from hapticrender.protocols import Array, Sensed
 
 
@@ -142,12 +142,8 @@ class OpenedInWith:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close; where the body has failed already, a failure to close is noted on the body's error."""
-        try:
+        with noted_on(error):
             self.close()
-        except Exception as second:
-            if error is None:
-                raise
-            error.add_note(f"and while closing: {second}")
 
 
 class BaseDriver(OpenedInWith):

@@ -19,7 +19,7 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import device_fault, motion_of_sensors, samples_late, stops_itself
+from hapticrender.loop import RECENT, device_fault, motion_of_sensors, samples_late, stops_itself
 from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
@@ -267,7 +267,9 @@ class LiveLoop(RealtimeEntry):
             return None
         if self.timed_out:
             return WatchdogTimeout(stopped / self.driver.rate)
-        return device_fault(self.rendering, None if self._itself else self.running, stopped)
+        before = round(RECENT * self.driver.rate)
+        flags = self.log(max(stopped - before, 0))["flags"][:before]
+        return device_fault(self.rendering, None if self._itself else self.running, stopped, flags)
 
     def _texture(self, rendering: Rendering) -> SampledTexture | EvaluatedTexture:
         try:
