@@ -141,6 +141,15 @@ def test_the_delay_is_measured_through_a_cable(connected, tmp_path, capsys):
     assert written == pytest.approx(measured, abs=0.006)  # the half of a last digit of either
 
 
+def test_the_delay_is_measured_in_blocks_of_any_length(connected, capsys):
+    """What waits to be played, 41 blocks, is 0.9 s, more than the longest round trip of a device that is looked for."""
+    connected(jack_ring.cable(0.3), noise=1e-3)
+    assert main(["latency", "--driver", f"audio:{CLIENT}?block=1024", "--runs", "2"]) == 0
+    text = capsys.readouterr().out
+    assert "in blocks of 1024; 2 runs" in text
+    assert 1024 <= float(text.split("delay ")[1].split()[0]) < 5 * 1024  # a block in, a block out, and PortAudio's own
+
+
 @pytest.mark.parametrize("stalls", [False, True])
 def test_the_ring_is_closed_by_the_compiled_callback_and_survives_an_overrun(connected, tmp_path, stalls):
     """8 bands under a finger at 48 kHz in periods of 64; 10 s, in which every period waits for all.
