@@ -28,7 +28,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
 ``host_delay`` (optional)
-    samples of `delay` that the device itself does not have, only a drive that the host computes: a profile is without
+    samples of `delay` that the device itself does not have, only a drive that the host computes: a profile is without;
+    where `Sensed.flags` have `Flag.OVERRUN` the device has played zeros for what the host computed so long before
 ``finger`` (optional)
     of a device that takes the finger's position from the host: None, until `render` sets it to the scene's `Finger`
 ``rendering``, ``device_kind`` (optional)
