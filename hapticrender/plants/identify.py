@@ -350,7 +350,7 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
             sensed = check_sensed(driver, given, 0)
             raised = Flag(0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
             if raised & Flag.OVERRUN:
-                cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and a sound server's)"
+                cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and sound server)"
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
             if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
                 raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
