@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import errno
 import inspect
 import warnings
@@ -30,7 +31,7 @@ EXTRAS = (  # package, extra, what it is good for
 SIMULATED = "simulated"
 SCALES = ("drive_per_full_scale", "sensed_per_full_scale", "delay")  # entries of a calibration that a driver takes
 _MADE: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by `open_driver`, by their id
-FORMS = "NAME, NAME:ARGUMENT, or package.module:callable for one of your own"
+FORMS = "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or package.module:callable for one of your own"
 
 
 def registered(group: str, name: str) -> Any:
@@ -53,7 +54,8 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
     text : str
         "simulated"; the name of an installed driver, with its argument after a colon ("audio:0", "serial:/dev/ttyACM0",
         "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a second colon, if
-        anything does.
+        anything does.  Behind a "?" are keyword arguments, numbers, numbers with commas between or words:
+        "audio:0?block=256&rate=44100&channels=3,4", "serial:/dev/ttyACM0?baud=921600".
     profile : DeviceProfile, optional
         Of the device: a driver gets those entries of its calibration, by keyword, that its parameters name
         (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter
@@ -87,8 +89,10 @@ def open_driver(text: str, profile: DeviceProfile | None = None, overwrite: bool
         factory = imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
-            options = {"overwrite": True} if overwrite and "overwrite" in inspect.signature(factory).parameters else {}
-            made = factory(*[argument] * bool(colon), **_calibration(factory, profile), **options)
+            argument, options = _split(argument)
+            if overwrite and "overwrite" in inspect.signature(factory).parameters:
+                options["overwrite"] = True
+            made = factory(*[argument] * bool(colon), **_calibration(factory, profile) | options)
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
     warn_of_calibration(text, profile, lambda name, _: {name, "profile"} & set(inspect.signature(factory).parameters))
@@ -154,6 +158,19 @@ def imported(text: str, module: str, called: str) -> Any:
     if not callable(factory):
         raise ValueError(f"driver = {text!r}: {called} is a {type(factory).__name__}: must be a class or a function")
     return factory
+
+
+def _split(argument: str) -> tuple[str, dict[str, Any]]:
+    """Split "0?block=256&channels=3,4" into argument and options; a "?" without them belongs to the argument."""
+    before, mark, after = argument.rpartition("?")
+    pairs = [each.partition("=") for each in after.split("&")]
+    if not mark or not all(name.isidentifier() and equals for name, equals, _ in pairs):
+        return argument, {}
+    options: dict[str, Any] = {name: value for name, _, value in pairs}
+    for name, value in options.items():
+        with suppress(ValueError, SyntaxError):  # a word
+            options[name] = ast.literal_eval(value)
+    return before, options
 
 
 def _calibration(factory: Callable[..., Any], profile: DeviceProfile | None) -> dict[str, Any]:

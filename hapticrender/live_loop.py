@@ -20,7 +20,16 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import CHUNK, departure, device_fault, differences, motion_of_sensors, samples_late, stops_itself
+from hapticrender.loop import (
+    CHUNK,
+    RECENT,
+    departure,
+    device_fault,
+    differences,
+    motion_of_sensors,
+    samples_late,
+    stops_itself,
+)
 from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
@@ -278,7 +287,9 @@ class LiveLoop(RealtimeEntry):
             return None
         if self.timed_out:
             return WatchdogTimeout(stopped / self.driver.rate)
-        return device_fault(self.rendering, None if self._itself else self.running, stopped)
+        before = round(RECENT * self.driver.rate)
+        flags = self.log(max(stopped - before, 0))["flags"][:before]
+        return device_fault(self.rendering, None if self._itself else self.running, stopped, flags)
 
     def _texture(self, rendering: Rendering) -> SampledTexture | EvaluatedTexture:
         try:

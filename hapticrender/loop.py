@@ -27,12 +27,13 @@ from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
-from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Renderer, Rendering, Sensed
+from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Flag, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
+RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows: one
 GUARDED: list[None] = []  # an entry for each run that one of these is to end by an exception
@@ -190,14 +191,17 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
     return Recorder(journal, **(arguments | changes))
 
 
-def device_fault(rendering: Rendering, controller: Any, sample: int) -> DeviceFault:
+def device_fault(rendering: Rendering, controller: Any, sample: int, flags: Array) -> DeviceFault:
     """Return the error of a drive that was stopped from `sample` on: what driver or controller have found.
 
-    No `controller`: the device stopped itself.
+    No `controller`: the device stopped itself.  `flags` are those of the samples before.
     """
     found = (getattr(owner, "fault", None) for owner in (rendering.driver, controller))
     text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
-    time = sample / rendering.driver.rate
+    time, lost = sample / rendering.driver.rate, int(np.count_nonzero(flags & Flag.OVERRUN))
+    if lost:
+        cure = "which may be all that is wrong: free the computer, or take larger blocks"
+        text = f"{lost} of the {len(flags)} samples until then were lost, {cure}; found was: {text}"
     return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 
 
@@ -314,6 +318,7 @@ class _Loop:
         self._contact = ContactLag(rendering.model.contact_lag)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
         self._late, self._has_motion = 0.0, False  # samples after which it is; whether the device states it
+        self._recent = np.zeros(0, int)  # flags
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -321,8 +326,10 @@ class _Loop:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
         self._start = start
         drive, target, flags, sensed = self._device_loop(count, self._reference)
-        if self._stopped < 0 and (flags & STOPPED).any():
-            self._stopped = start + int(np.argmax(flags & STOPPED))
+        if self._stopped < 0:
+            self._recent = np.append(self._recent, flags)[-round(RECENT * self.rendering.driver.rate) :]
+            if (flags & STOPPED).any():
+                self._stopped = start + int(np.argmax(flags & STOPPED))
         values, time = sensed.sensed, self._time(len(sensed.sensed))
         finger = self.rendering.scene.finger
         position = finger.position(time) if sensed.position is None else sensed.position
@@ -352,7 +359,7 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        return device_fault(self.rendering, None if self._itself else self.controller, self._stopped)
+        return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
@@ -365,6 +372,9 @@ class _Loop:
         if position is None:
             position = self.rendering.scene.finger.position(self._time(driver.block))
         sensed = sensed._replace(position=position)
+        if sensed.flags is not None and hasattr(driver, "host_delay") and hasattr(self.controller, "unplayed"):
+            device_delay = driver.delay - driver.host_delay
+            self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
         self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
         return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
 

@@ -33,7 +33,7 @@ from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
-from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_playlist import LivePlaylist, parts_of
@@ -139,11 +139,11 @@ class Player(Addressed):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
+        """Zero drive, then close the device and the recording; a fault not seen yet is raised, later ones noted."""
         atexit.unregister(self.__exit__)
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        with ExitStack() as last:  # from the last to the first, whatever fails
+        with noted_on(error or (None if self._raised else self._error)), ExitStack() as last:  # last to first
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened
                 self._entered = False
@@ -297,7 +297,7 @@ class Player(Addressed):
             if self.time > seen:
                 seen, since = self.time, time.monotonic()
             if time.monotonic() - since > self._timeout:
-                raise HapticError(f"the device has played no sample for {self._timeout:.3g} s: check it and its driver")
+                raise DeviceTimeout(f"the device has played no sample for {self._timeout:.3g} s: check it and driver")
             with self._lock:
                 self._check()
 
@@ -348,9 +348,9 @@ class Player(Addressed):
         driver = driver.live() if hasattr(driver, "live") else driver
         try:
             return self._start(prepare(scenes[0], driver=driver), scenes[1:])
-        except BaseException:
-            self._loop = None  # what has been opened is left at rest
-            self._stack.close()
+        except BaseException as error:
+            with noted_on(error), self._stack:  # what has been opened is left at rest
+                self._loop = None
             raise
 
     def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:

@@ -173,6 +173,10 @@ class SupervisedController(Addressed):
         """Gain to which a ringing inner damper has been turned down, 1: it did not ring."""
         return float(self.state["damper_scale"][0])
 
+    def unplayed(self, samples: Array) -> None:
+        """Compare motion with no drive where that which acts so many samples from now on was not played."""
+        self._forces[(self.state["now"] + samples) % len(self._forces)] = 0.0
+
     run = BankController.run
 
 
