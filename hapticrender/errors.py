@@ -88,10 +88,22 @@ REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, 
 
 
 @contextmanager
+def noted_on(first: BaseException | None) -> Iterator[None]:
+    """Note what fails within, while a device is closed, on the error that came before; without one it is raised."""
+    try:
+        yield
+    except Exception as late:
+        if first is None:
+            raise
+        first.add_note(f"and while closing: {late}")
+
+
+@contextmanager
 def naming(where: object) -> Iterator[None]:
     """Begin every message within with `where`, a file or a scene, in one line, and raise it as a `SceneError`."""
     try:
         yield
     except REFUSED as problem:
-        start, text = f"{' '.join(str(where).split())}: ", str(problem)
+        start = f"{' '.join(str(where).split())}: "
+        text = "; ".join([str(problem), *getattr(problem, "__notes__", ())])
         raise SceneError(text if text.startswith(start) else start + text) from problem

@@ -152,6 +152,23 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert not (tmp_path / "out" / "sensed.wav").exists()
 
 
+def test_a_file_is_played_live(run, tiny, tmp_path):
+    """What the page's recording has as drive is what the file has from where the recording began."""
+    played = tmp_path / "played.wav"
+    arguments = ["--out", tmp_path / "out", "--seconds", "0.2", "--driver", f"wavefile:{played}"]
+    status, out, _ = run("play", tiny, *arguments)
+    assert status == 0
+    assert "page: " in out
+    recording = Recording.load(tmp_path / "out" / "tiny" / "recording.au")
+    samples, rate = soundfile.read(played)
+    drive, n = recording.drive, len(recording)
+    assert rate == recording.rate
+    assert n >= 0.15 * rate
+    assert abs(drive).max() > 0.0
+    starts = range(len(samples) - n + 1)
+    assert any(abs(3.0 * samples[start : start + n] - drive).max() < 3.0 * 2.0**-23 for start in starts)
+
+
 RAISED = [
     (lambda *_: {}["usb"], "hapticrender: other_plate:OtherPlate: KeyError: 'usb'"),
     (lambda *_: sys.exit(0), "hapticrender: the driver, or what it uses, ended the program: SystemExit(0)"),
