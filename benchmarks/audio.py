@@ -76,7 +76,7 @@ def print_ring(device: jack_ring.Device, folder: Path, freewheel: bool) -> None:
             device.say("run 7500")
         else:
             time.sleep(10)
-        load, lost = live.load, live.overruns
+        load, lost = live.cpu_load, live.overruns
         live.stop()
         errors = jack_ring.relative_errors(device, folder / "record", live.last_sensed, entry.samples)[0]
     amplitude, phase = abs(abs(1 + errors) - 1).max(), abs(np.angle(1 + errors, deg=True)).max()

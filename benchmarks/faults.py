@@ -1,11 +1,12 @@
 """Inject faults of sensors and coils into a plate that the library does not know, while a texture plays.
 
-Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones | --card] [fault ...]
+Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones] [--card | --blocks] [fault ...]
 
 The plate is that of ``tests/strangers_plate.py`` with mass, springs, damping and sensor gains off by 2 to 20 %, a
 bending mode at 1250 Hz, contact reported 5 ms late, and a delay of 2 samples, which is stated; ``--plate other`` takes
 that of ``tests/other_plate.py``, whose parameters are what the library takes for granted; with ``--card`` the
-stranger's plate takes blocks of 64 at 48 kHz, as behind a sound card, and is one sample later than stated.
+stranger's plate takes blocks of 64 at 48 kHz, as behind a sound card, and is one sample later than stated; with
+``--blocks`` it takes blocks of 25 at 5 kHz, and is one sample later than stated, too.
 Printed for every fault, over 10 and 50 um, without and with a heavy finger of 0.8 N on the middle, or `--place` (mm)
 off it, then with 0.8 and 2 N: the time from the fault to the stop, how many runs stopped, the largest drive and the
 largest true motion of an end.  Textures are a tone of 20, 72, 189 or 400 Hz; with ``--tones`` one of 60 and 144 Hz.
@@ -95,7 +96,8 @@ FAULTS = {
     "none": (lambda plate, sensed: sensed, np.eye(2)),
     "frozen, both": (lambda plate, sensed: 0 * sensed + plate.held[0], np.eye(2)),
     "frozen, one": (only_first(lambda plate, sensed: 0 * sensed + plate.held[0]), np.eye(2)),
-    "buffer repeats, one": (only_first(lambda plate, sensed: plate.held), np.eye(2)),  # without `--card` as frozen
+    "buffer repeats, both": (lambda plate, sensed: plate.held, np.eye(2)),  # as frozen where a block is a sample
+    "buffer repeats, one": (only_first(lambda plate, sensed: plate.held), np.eye(2)),
     "dead, both": (lambda plate, sensed: 0 * sensed, np.eye(2)),
     "dead, one": (only_first(lambda plate, sensed: 0 * sensed), np.eye(2)),
     "at its range, both": (lambda plate, sensed: 0 * sensed + 1e-3, np.eye(2)),
@@ -118,7 +120,7 @@ FAULTS = {
     "one coil dead": (lambda plate, sensed: sensed, np.diag([0.0, 1.0])),
 }
 PLATES = {"other": FaultyOtherPlate, "wrong": FaultyWrongPlate}
-CARD = {"rate": 48e3, "block": 64, "told": 64}
+CARD, BLOCKS = {"rate": 48e3, "block": 64, "told": 64}, {"block": 25, "told": 25}
 
 
 def run(plate, texture):
@@ -141,7 +143,9 @@ def main():
     parser.add_argument("faults", nargs="*", metavar="fault", help=f"of {', '.join(FAULTS)}; all unless given")
     parser.add_argument("--plate", choices=PLATES, default="wrong", help="which plate")
     parser.add_argument("--tones", action="store_true", help="two tones at once, instead of one")
-    parser.add_argument("--card", action="store_true", help="48 kHz, in blocks of 64, on the stranger's plate")
+    ways = parser.add_mutually_exclusive_group()
+    ways.add_argument("--card", action="store_true", help="48 kHz, in blocks of 64, on the stranger's plate")
+    ways.add_argument("--blocks", action="store_true", help="5 kHz, in blocks of 25, on the stranger's plate")
     parser.add_argument("--place", type=float, default=0.0, help="of the finger (mm)")
     arguments = parser.parse_args()
     if unknown := set(arguments.faults) - set(FAULTS):
@@ -149,7 +153,7 @@ def main():
     if abs(arguments.place) > 1e3 * REACH:
         parser.error(f"--place {arguments.place:g} mm: must be within {1e3 * REACH:g}, the ends of the plate")
     loads = (0.8, 2.0) if arguments.place else (0.0, 0.8)
-    changes = CARD if arguments.card else {}
+    changes = CARD if arguments.card else BLOCKS if arguments.blocks else {}
     textures = [TONES] if arguments.tones else [{"frequency": each} for each in FREQUENCIES]
     for fault, texture in product(arguments.faults or FAULTS, textures):
         runs = [

@@ -1,6 +1,6 @@
 """Measure live play: the compiled callback of the waveform law, how soon `finger` acts, and how well textures play.
 
-Run: python -m benchmarks.live [--calls 2000]
+Run: python -m benchmarks.live [--calls 2000] [--sessions 8]
 
 The callback at 48 kHz in blocks of 64, with a simulated plate behind it; in ratios to the time of a block, and to an
 empty callback called alike.  Errors are those of a third party's plate (``tests/strangers_plate.py``) behind the public
@@ -8,6 +8,7 @@ driver protocol, of its true motion, 20-500 Hz, without shift or gain fit: under
 """
 
 import argparse
+import itertools
 import tempfile
 import time
 from dataclasses import replace
@@ -46,19 +47,27 @@ def entry_of(texture: hr.Texture) -> RealtimeEntry:
 
 
 def finger_latency(calls: int) -> tuple[float, int, int]:
-    """Median time (s) of a call of `finger`; samples until a new position changes the drive, and by a tenth.
+    """Median time (s) of a call of `Player.finger`; samples from it to another drive at the device, and by a tenth.
 
-    A sliding finger is set 0.1 mm away, on one of two entries that are alike; a tenth of their largest difference.
+    Of two players that are alike one sets a sliding finger 0.1 mm from where it was expected; a tenth of the largest
+    difference of their drives in 40 ms, after which the finger still slides.
     """
-    entries, spent = [entry_of(TEXTURES["64 ridges"]) for _ in range(2)], np.empty(calls)
-    for call in range(calls):
-        start = time.perf_counter()
-        entries[0].finger(-0.02 + 1e-6 * call, 0.0, 0.4)
-        spent[call] = time.perf_counter() - start
+    spent, drives = np.empty(calls), []
     for shift in (0.0, 1e-4):
-        for entry, own in zip(entries, (0.0, shift), strict=True):
-            entry.finger(-0.02 + 0.05 * entry.samples / RATE + own, 0.05, 0.4)
-        drives = [entry.process(np.zeros((40 * BLOCK, 2))) for entry in entries]
+        plate = StrangersPlate(rate=RATE, block=BLOCK)
+        with tempfile.TemporaryDirectory() as folder, hr.Player("vt-plate", plate, paced=False) as player:
+            player.play(hr.Grating(wavelength=1e-3, amplitude=50e-6))
+            for _ in range(50):
+                player.finger(-0.02 + 0.05 * player.time, 0.05, 0.4)
+                player.sleep(0.01)
+            player.record(Path(folder) / "session.au")
+            player.finger(-0.02 + 0.05 * player.time + shift, 0.05, 0.4)
+            player.sleep(0.04)
+            drives.append(player.end_recording().drive)
+            for call in range(calls):
+                start = time.perf_counter()
+                player.finger(-0.02 + 1e-6 * call, 0.0, 0.4)
+                spent[call] = time.perf_counter() - start
     change = abs(drives[0] - drives[1]).max(axis=1)
     first, tenth = (int(np.argmax(change > share * change.max())) for share in (0.0, 0.1))
     return float(np.median(spent)), first, tenth
@@ -96,7 +105,9 @@ def main() -> None:
     """Print every figure."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--calls", type=int, default=2000, help="calls timed (default: 2000)")
-    calls, block = parser.parse_args().calls, BLOCK / RATE
+    parser.add_argument("--sessions", type=int, default=8, help="of which errors are measured, 1 to 8 (default)")
+    arguments = parser.parse_args()
+    calls, block = arguments.calls, BLOCK / RATE
     empty, _ = seconds_of(EMPTY.address, 0, calls)
     print(f"empty callback                  {100 * empty / block:6.2f} % of a block of {1e3 * block:.2f} ms")
     for name, texture in TEXTURES.items():
@@ -106,8 +117,10 @@ def main() -> None:
             f"waveform law, {name:<22}{100 * median / block:8.1f} %, 99 % of the calls below {100 * late / block:.0f} %"
         )
     call, first, tenth = finger_latency(calls)
-    print(f"finger(): {1e6 * call:.1f} us; another drive from sample {first} of the next block on, by a tenth {tenth}")
-    runs = [session(each, place, phase) for each in FINGERS.values() for place in (0.0, 0.02) for phase in (0.0, 0.3)]
+    late = f"{first} samples later ({1e3 * first / RATE:.2f} ms), by a tenth {1e3 * tenth / RATE:.1f} ms"
+    print(f"Player.finger(): {1e6 * call:.1f} us; the device plays another drive {late}")
+    cases = itertools.product(FINGERS.values(), (0.0, 0.02), (0.0, 0.3))
+    runs = [session(*case) for case in itertools.islice(cases, arguments.sessions)]
     median, worst = 100 * np.median(runs, axis=0), 100 * np.max(runs, axis=0)
     print(f"third party's plate, {len(runs)} sessions: median and worst error, under the finger / at the worse end")
     for what, middle, most in zip(WHAT, median, worst, strict=True):

@@ -10,21 +10,24 @@ from __future__ import annotations
 import atexit
 import copy
 import time
+from shlex import quote
 from typing import Any
 
 import numpy as np
 
 from hapticrender.checks import number
-from hapticrender.drivers.audio_callback import AHEAD, BlockQueue, Relay
+from hapticrender.drivers.audio_callback import AHEAD, SLOTS, BlockQueue, Relay
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.portaudio import Stream, cards, find
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
 
+RATE, BLOCK = 48000.0, 64  # Hz, samples a callback; unless they are given
 TIMEOUT = 2.0  # s: longest wait for a block
 LONGEST = 10.0  # s: delay that no set-up has
 OVERRUN, SATURATED = int(Flag.OVERRUN), int(Flag.SATURATED)
 FAR_AHEAD = 40  # blocks that wait to be played through a cable: nothing is computed from what is sensed
+MOST_LATE = SLOTS // 2  # blocks that Python may be late and still get all that was sensed
 FULL_SCALE = 3.0  # A: drive at full scale, as in the sound files of `WaveFileDriver`, unless it is given
 Channels = tuple[int, ...]
 
@@ -74,8 +77,8 @@ class AudioDriver(BaseDriver):
         channels: Channels = (1, 2),
         sensed_channels: Channels | None = None,
         *,
-        rate: float = 48000.0,
-        block: int = 64,
+        rate: float = RATE,
+        block: int = BLOCK,
         latency: Any = "low",
         drive_per_full_scale: float = FULL_SCALE,
         sensed_per_full_scale: float | None = None,
@@ -116,6 +119,11 @@ class AudioDriver(BaseDriver):
         """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
         return (1 + self._ahead) * self.block
 
+    @property
+    def host_delay(self) -> int:
+        """Samples of `delay` that the card itself does not have: `queued`, of a driver for `play`; else 0."""
+        return self.delay - (self.play_delay - self.queued)
+
     def live(self) -> AudioDriver:
         """Make the same driver for a compiled controller: its `delay` is the card's, `play_delay` is that of `play`."""
         driver = copy.copy(self)
@@ -141,8 +149,9 @@ class AudioDriver(BaseDriver):
         if self._unknown:
             raise DriverError(
                 f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
-                f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver {self} "
-                "--out profile.toml`, and give sensed_per_full_scale; or neither, or sensed_channels=(), for open loop"
+                f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver "
+                f"{quote(str(self))} --out profile.toml`, and give sensed_per_full_scale; or neither, or "
+                "sensed_channels=(), for open loop"
             )
 
     def _open(self) -> None:
@@ -193,8 +202,9 @@ class AudioDriver(BaseDriver):
         if self._entry is not None:
             raise DriverError(f"{self}: play: it runs a controller; stop it first")
         number, queue = self._number, self._queue
-        if not queue.put(number + self._ahead, drive * self.drive_scale):
-            number = queue.blocks  # what was missed is lost; go on with the next one
+        queue.put(number + self._ahead, drive * self.drive_scale)
+        if queue.blocks - number > MOST_LATE:
+            number = queue.blocks  # what is older is lost; go on with the next one
         if self._relay.count("function") == 0:
             self._relay.call(queue.address, queue.user_data)
         self._wait_for(number)
@@ -293,7 +303,9 @@ class AudioDriver(BaseDriver):
         return 0.0 if self._stream is None else self._stream.load
 
     def __str__(self) -> str:
-        return f"audio:{'' if self.device is None else self.device}"
+        chosen = (("block", self.block, BLOCK), ("rate", self.rate, RATE))
+        options = "&".join(f"{name}={value:g}" for name, value, usual in chosen if value != usual)
+        return f"audio:{'' if self.device is None else self.device}{options and '?'}{options}"
 
 
 def _channels(name: str, given: Any) -> Channels:

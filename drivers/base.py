@@ -27,6 +27,9 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     of an open device with a controller of its own: the same, playing the drive of the host, in a `with` statement
 ``play_delay`` (optional)
     delay of `play`, where `delay` is that of a callback which plays a compiled controller (`start`, `stop`)
+``host_delay`` (optional)
+    samples of `delay` that the device itself does not have, only a drive that the host computes: a profile is without;
+    where `Sensed.flags` have `Flag.OVERRUN` the device has played zeros for what the host computed so long before
 ``finger`` (optional)
     of a device that takes the finger's position from the host: None, until `render` sets it to the scene's `Finger`
 ``rendering``, ``device_kind`` (optional)
@@ -106,7 +109,7 @@ from typing import Self
 import numpy as np
 
 from hapticrender.driver_checks import check_driver as check_driver
-from hapticrender.errors import DriverError
+from hapticrender.errors import DriverError, noted_on
 from hapticrender.protocols import Array, Sensed
 
 
@@ -140,12 +143,8 @@ class OpenedInWith:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Close; where the body has failed already, a failure to close is noted on the body's error."""
-        try:
+        with noted_on(error):
             self.close()
-        except Exception as second:
-            if error is None:
-                raise
-            error.add_note(f"and while closing: {second}")
 
 
 class BaseDriver(OpenedInWith):

@@ -203,7 +203,8 @@ def _line(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return f"not enough memory: {error}"
     named = isinstance(error, OSError) and error.filename
-    return f"{error.filename}: {error.strerror}" if named else str(error)  # type: ignore[attr-defined]
+    text = f"{error.filename}: {error.strerror}" if named else str(error)  # type: ignore[attr-defined]
+    return "; ".join([text, *getattr(error, "__notes__", ())])
 
 
 def _parser() -> argparse.ArgumentParser:

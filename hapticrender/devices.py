@@ -1,5 +1,6 @@
 """What is installed and what is there: kinds of device, drivers, extras; and drivers chosen by a text."""
 
+import ast
 import errno
 import inspect
 import warnings
@@ -27,7 +28,7 @@ EXTRAS = (  # package, extra, what it is good for
 SIMULATED = "simulated"
 SCALES = ("drive_per_full_scale", "sensed_per_full_scale", "delay")  # entries of a calibration that a driver takes
 _MADE: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by `open_driver`, by their id
-FORMS = "NAME, NAME:ARGUMENT, or package.module:callable for one of your own"
+FORMS = "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or package.module:callable for one of your own"
 
 
 def registered(group: str, name: str) -> Any:
@@ -47,10 +48,12 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
 
     `text` is "simulated"; the name of an installed driver, with its argument after a colon ("audio:0",
     "serial:/dev/ttyACM0", "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a
-    second colon, if anything does.  A driver gets those entries of the calibration in the device's `profile`, by
-    keyword, that its parameters name (``drive_per_full_scale``, ``sensed_per_full_scale``, ``delay``,
-    ``gain_uncertainty``), and a parameter ``profile`` the profile itself; a warning names what is stated and not taken.
-    `overwrite` is handed, where true, to a driver that has a parameter of that name.
+    second colon, if anything does.  Behind a "?" are keyword arguments, numbers, numbers with commas between or words:
+    "audio:0?block=256&rate=44100&channels=3,4", "serial:/dev/ttyACM0?baud=921600".  A driver gets those entries of the
+    calibration in the device's `profile`, by keyword, that its parameters name (``drive_per_full_scale``,
+    ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter ``profile`` the profile itself; a
+    warning names what is stated and not taken.  `overwrite` is handed, where true, to a driver that has a parameter of
+    that name.
 
     A ValueError where there is no such driver, or it does not take the argument; a HapticError where a package that it
     needs is not installed, or cannot be loaded; a DriverError where the device is not there, or the callable raised
@@ -71,14 +74,15 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
         factory = imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
+            argument, options = _split(argument)
             taken = inspect.signature(factory).parameters if profile or overwrite else {}
             offered = {
                 **(vars(profile.calibration) if profile else {}),
                 "profile": profile,
                 "overwrite": overwrite or None,
             }
-            options = {name: value for name, value in offered.items() if name in taken and value is not None}
-            made = factory(*[argument] * bool(colon), **options)
+            known = {name: value for name, value in offered.items() if name in taken and value is not None}
+            made = factory(*[argument] * bool(colon), **known | options)
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
     warn_of_calibration(text, profile, lambda name, _: name in taken or "profile" in taken)
@@ -143,6 +147,19 @@ def imported(text: str, module: str, called: str) -> Any:
     if not callable(factory):
         raise ValueError(f"driver = {text!r}: {called} is a {type(factory).__name__}: must be a class or a function")
     return factory
+
+
+def _split(argument: str) -> tuple[str, dict[str, Any]]:
+    """Split "0?block=256&channels=3,4" into argument and options; a "?" without them belongs to the argument."""
+    before, mark, after = argument.rpartition("?")
+    pairs = [each.partition("=") for each in after.split("&")]
+    if not mark or not all(name.isidentifier() and equals for name, equals, _ in pairs):
+        return argument, {}
+    options: dict[str, Any] = {name: value for name, _, value in pairs}
+    for name, value in options.items():
+        with suppress(ValueError, SyntaxError):  # a word
+            options[name] = ast.literal_eval(value)
+    return before, options
 
 
 def _cure(error: BaseException) -> str:

@@ -88,6 +88,17 @@ REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, 
 
 
 @contextmanager
+def noted_on(first: BaseException | None) -> Iterator[None]:
+    """Note what fails within, while a device is closed, on the error that came before; without one it is raised."""
+    try:
+        yield
+    except Exception as late:
+        if first is None:
+            raise
+        first.add_note(f"and while closing: {late}")
+
+
+@contextmanager
 def naming(where: object) -> Iterator[None]:
     """Begin every message within but a driver's with `where`, a file or a scene, and raise it as a `SceneError`."""
     try:
@@ -95,5 +106,6 @@ def naming(where: object) -> Iterator[None]:
     except DriverError:
         raise
     except REFUSED as problem:
-        start, text = f"{' '.join(str(where).split())}: ", str(problem)
+        start = f"{' '.join(str(where).split())}: "
+        text = "; ".join([str(problem), *getattr(problem, "__notes__", ())])
         raise SceneError(text if text.startswith(start) else start + text) from problem

@@ -13,7 +13,6 @@ addresses closes any plant with any controller, and a third party may give a ste
 from __future__ import annotations
 
 import hashlib
-import inspect
 import sys
 import threading
 import time
@@ -270,5 +269,5 @@ def close_loop(plant, control, count, block):
         call(control[0], (control[1], control[2], start, block))
 
 
-if inspect.isfunction(close_loop):
+if not hasattr(close_loop, "py_func"):  # numba has compiled nothing
     raise HapticError("NUMBA_DISABLE_JIT is set, must not be: the kernels run as compiled code only: unset it")

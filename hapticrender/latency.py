@@ -23,7 +23,7 @@ from hapticrender.errors import DriverError
 from hapticrender.protocols import Array, Flag
 from hapticrender.touch.device_profile import DeviceProfile
 
-BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round trip that can be found
+BURST, TAIL = 0.05, 0.5  # s: noise that is played; after it, the longest round trip of a device that can be found
 FEWEST = 2048  # samples of a burst
 BAND = (0.05, 0.4)  # of the rate
 LEAST_CORRELATION = 0.5  # of what is sensed with what was played
@@ -136,7 +136,8 @@ def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | Non
     block = driver.block
     length = -(-max(round(BURST * driver.rate), FEWEST) // block) * block
     burst = amplitude * rng.choice([-1.0, 1.0], length)
-    played = np.concatenate([burst, np.zeros(-(-round(TAIL * driver.rate) // block) * block)])
+    tail = round(TAIL * driver.rate) + getattr(driver, "queued", 0)
+    played = np.concatenate([burst, np.zeros(-(-tail // block) * block)])
     sensed, lost = np.empty_like(played), np.zeros(len(played), bool)
     for start in range(0, len(played), block):
         drive = np.zeros((block, driver.drive_channels))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +20,16 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import device_fault, motion_of_sensors, samples_late, stops_itself
+from hapticrender.loop import (
+    CHUNK,
+    RECENT,
+    departure,
+    device_fault,
+    differences,
+    motion_of_sensors,
+    samples_late,
+    stops_itself,
+)
 from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
@@ -260,6 +270,16 @@ class LiveLoop(RealtimeEntry):
         first, signals = self.signals(self.samples - round(JUDGED * self.driver.rate))
         return band_figures(self.rendering.bands, first, self.driver.rate, signals)
 
+    def compare(self) -> Callable[[], tuple[str, ...]]:
+        """Note how the device departs from the model of the controller that runs; `differences` when that is called."""
+        end, found = self.samples, (1.0, 0.0) if self.stopped is not None else departure(self.running)
+
+        def state() -> tuple[str, ...]:
+            first, signals = self.signals(end - round(CHUNK * self.driver.rate))
+            return differences(self.rendering, *found, {name: each[: end - first] for name, each in signals.items()})
+
+        return state
+
     def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""
         stopped = self.stopped
@@ -267,7 +287,9 @@ class LiveLoop(RealtimeEntry):
             return None
         if self.timed_out:
             return WatchdogTimeout(stopped / self.driver.rate)
-        return device_fault(self.rendering, None if self._itself else self.running, stopped)
+        before = round(RECENT * self.driver.rate)
+        flags = self.log(max(stopped - before, 0))["flags"][:before]
+        return device_fault(self.rendering, None if self._itself else self.running, stopped, flags)
 
     def _texture(self, rendering: Rendering) -> SampledTexture | EvaluatedTexture:
         try:

@@ -27,12 +27,13 @@ from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
-from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Renderer, Rendering, Sensed
+from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Flag, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
+RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows: one
 GUARDED: list[None] = []  # an entry for each run that one of these is to end by an exception
@@ -161,7 +162,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             raise fault
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
-    _compare(rendering, loop.controller, recording)
+    start = max(len(recording) - round(CHUNK * recording.rate), 0)
+    last = {name: recording.read(name, start) for name in ("position", "drive", "sensed")}
+    recording.warnings = differences(rendering, *departure(loop.controller), last)
+    warn_of(recording.warnings, recording)
     return recording
 
 
@@ -187,14 +191,17 @@ def recorder_of(rendering: Rendering, journal: str | Path | None = None, **chang
     return Recorder(journal, **(arguments | changes))
 
 
-def device_fault(rendering: Rendering, controller: Any, sample: int) -> DeviceFault:
+def device_fault(rendering: Rendering, controller: Any, sample: int, flags: Array) -> DeviceFault:
     """Return the error of a drive that was stopped from `sample` on: what driver or controller have found.
 
-    No `controller`: the device stopped itself.
+    No `controller`: the device stopped itself.  `flags` are those of the samples before.
     """
     found = (getattr(owner, "fault", None) for owner in (rendering.driver, controller))
     text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
-    time = sample / rendering.driver.rate
+    time, lost = sample / rendering.driver.rate, int(np.count_nonzero(flags & Flag.OVERRUN))
+    if lost:
+        cure = "which may be all that is wrong: free the computer, or take larger blocks"
+        text = f"{lost} of the {len(flags)} samples until then were lost, {cure}; found was: {text}"
     return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 
 
@@ -311,6 +318,7 @@ class _Loop:
         self._contact = ContactLag(rendering.model.contact_lag)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
         self._late, self._has_motion = 0.0, False  # samples after which it is; whether the device states it
+        self._recent = np.zeros(0, int)  # flags
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
 
@@ -318,8 +326,10 @@ class _Loop:
         """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
         self._start = start
         drive, target, flags, sensed = self._device_loop(count, self._reference)
-        if self._stopped < 0 and (flags & STOPPED).any():
-            self._stopped = start + int(np.argmax(flags & STOPPED))
+        if self._stopped < 0:
+            self._recent = np.append(self._recent, flags)[-round(RECENT * self.rendering.driver.rate) :]
+            if (flags & STOPPED).any():
+                self._stopped = start + int(np.argmax(flags & STOPPED))
         values, time = sensed.sensed, self._time(len(sensed.sensed))
         finger = self.rendering.scene.finger
         position = finger.position(time) if sensed.position is None else sensed.position
@@ -349,7 +359,7 @@ class _Loop:
         rate, driver = self.rendering.driver.rate, self.rendering.driver
         if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
             return None
-        return device_fault(self.rendering, None if self._itself else self.controller, self._stopped)
+        return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
@@ -362,6 +372,9 @@ class _Loop:
         if position is None:
             position = self.rendering.scene.finger.position(self._time(driver.block))
         sensed = sensed._replace(position=position)
+        if sensed.flags is not None and hasattr(driver, "host_delay") and hasattr(self.controller, "unplayed"):
+            device_delay = driver.delay - driver.host_delay
+            self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
         self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
         return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
 
@@ -400,50 +413,56 @@ class _Loop:
         return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
 
 
-def _compare(rendering: Rendering, controller: Controller, recording: Recording) -> None:
-    """Warn where the device differs from the model that the controller was designed for."""
-    scale, source = getattr(controller, "damper_scale", 1.0), rendering.scene.source
-    messages = []
-    profile = f", profile {source}" if source else ""
+def departure(controller: Controller) -> tuple[float, float]:
+    """Gain to which an inner damper was turned down, and share that a controller adds to what its model asks for."""
+    return getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
+
+
+def differences(rendering: Rendering, scale: float, mismatch: float, last: dict[str, Array]) -> tuple[str, ...]:
+    """State by its `departure` where the device differs from a model; `last`: signals of the last `CHUNK` seconds."""
+    source, messages = rendering.scene.source, []
     if scale < 1.0:
         message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
         message += "the sensors' noise where there is none"
         message += f", which profile {source} lacks" if source else ""
         messages.append(message)
-    mismatch = getattr(controller, "mismatch", 0.0)
     if mismatch > MISMATCH:
-        messages.append(_mismatch(rendering, recording, mismatch, profile))
-    recording.warnings = tuple(messages)
+        messages.append(_mismatch(rendering, last, mismatch))
+    return tuple(messages)
+
+
+def warn_of(messages: tuple[str, ...], recording: Recording | None = None) -> None:
+    """Warn of `differences`, in the name of the caller's caller; as an error it must not lose what was played."""
     for message in messages:
         try:
             warnings.warn(message, PlateMismatch, stacklevel=3)
-        except PlateMismatch as error:  # as an error it must not lose what was played
+        except PlateMismatch as error:
             error.recording = recording
             raise
 
 
-def _mismatch(rendering: Rendering, recording: Recording, mismatch: float, profile: str) -> str:
+def _mismatch(rendering: Rendering, last: dict[str, Array], mismatch: float) -> str:
     """State by how much the device differs from its model, at which frequencies, and what to do."""
-    errors = _stiffness_errors(rendering, recording)
+    errors, source = _stiffness_errors(rendering, last), rendering.scene.source
     found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
     cure = "correct [device]"
     if rendering.scene.device == "vt-plate":
         cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
     return (
-        f"the device differs from its model{profile}: the controller adds {100 * mismatch:.1f} % to what that asks for "
-        f"(bound {100 * MISMATCH:g} %){f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
+        f"the device differs from its model{f', profile {source}' if source else ''}: the controller adds "
+        f"{100 * mismatch:.1f} % to what that asks for (bound {100 * MISMATCH:g} %)"
+        f"{f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
     )
 
 
-def _stiffness_errors(rendering: Rendering, recording: Recording) -> list[tuple[float, float]]:
+def _stiffness_errors(rendering: Rendering, last: dict[str, Array]) -> list[tuple[float, float]]:
     """Relative error of the model's dynamic stiffness |D_11| at every fixed carrier (Hz), without a finger.
 
-    Least squares of all carriers over the last `CHUNK` seconds; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
+    Least squares of all carriers over the `last` signals; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
     """
     model, bands = rendering.model, rendering.bands
     hertz = np.unique(bands.frequency[(bands.wavenumber == 0.0) & (bands.frequency > 0.0)])
-    start = max(len(recording) - round(CHUNK * recording.rate), 0)
-    position, drive, sensed = (recording.read(name, start) for name in ("position", "drive", "sensed"))
+    position, drive, sensed = (last[name] for name in ("position", "drive", "sensed"))
     if not hertz.size or np.isfinite(position).any() or len(drive) < 8 * len(hertz):
         return []
     phase = 2 * np.pi / model.rate * np.multiply.outer(np.arange(len(drive)), hertz)

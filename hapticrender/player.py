@@ -33,12 +33,12 @@ from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.driver_checks import opened_once
-from hapticrender.errors import HapticError, WatchdogTimeout
+from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
+from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, warn_of, zero_drive_after
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
@@ -116,24 +116,20 @@ class Player(Addressed):
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
-        self._motion = LiveMotion()
+        self._motion, self._playlist = LiveMotion(), LivePlaylist()
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
         self._loop: LiveLoop | None = None
-        self._gain, self._lost = 1.0, 0
-        self._playlist = LivePlaylist()
+        self._gain, self._lost, self._raised = 1.0, 0, False
         self._error: BaseException | None = None
-        self._raised = False
         self._recorder: Recorder | None = None
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
-        self._calls = 0  # of the application that are under way
-        self._watched = math.inf  # s: the watchdog's time at the moment
+        self._calls, self._watched = 0, math.inf  # of the application under way; s: the watchdog's time at the moment
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
         self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
-        self._stopping = self._threads.stopping
+        self._stopping, self._timeout = self._threads.stopping, TIMEOUT  # s; and two blocks of the driver
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
-        self._timeout = TIMEOUT  # s; and two blocks of the driver
 
     def __enter__(self) -> Self:
         self._entered = True
@@ -143,21 +139,24 @@ class Player(Addressed):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
+        """Zero drive, then close the device and the recording; a fault not seen yet is raised, later ones noted."""
         atexit.unregister(self.__exit__)
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        with ExitStack() as last:  # from the last to the first, whatever fails
+        with noted_on(error or (None if self._raised else self._error)), ExitStack() as last:  # last to first
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened
                 self._entered = False
                 last.push(self._stack.pop_all())
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
+            failed = self._error is not None or isinstance(error, Exception)  # which Ctrl-C is not
+            compared = getattr(None if failed else self._loop, "compare", lambda: tuple)()  # while it plays
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
             raise HapticError(slow)
+        warn_of(compared())
 
     @property
     def time(self) -> float:
@@ -264,7 +263,9 @@ class Player(Addressed):
             recorder, self._recorder = self._recorder, None
             if self._unwritten is not None:
                 raise self._unwritten
-            return recorder.finish()
+            recording = recorder.finish()
+            recording.warnings = getattr(self._loop, "compare", lambda: tuple)()()
+            return recording
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""
@@ -296,7 +297,7 @@ class Player(Addressed):
             if self.time > seen:
                 seen, since = self.time, time.monotonic()
             if time.monotonic() - since > self._timeout:
-                raise HapticError(f"the device has played no sample for {self._timeout:.3g} s: check it and its driver")
+                raise DeviceTimeout(f"the device has played no sample for {self._timeout:.3g} s: check it and driver")
             with self._lock:
                 self._check()
 
@@ -344,13 +345,12 @@ class Player(Addressed):
         driver: Any = self._driver
         if isinstance(driver, str):
             driver = open_driver(driver, scenes[0].device_profile)
-        if hasattr(driver, "live"):
-            driver = driver.live()
+        driver = driver.live() if hasattr(driver, "live") else driver
         try:
             return self._start(prepare(scenes[0], driver=driver), scenes[1:])
-        except BaseException:
-            self._loop = None  # what has been opened is left at rest
-            self._stack.close()
+        except BaseException as error:
+            with noted_on(error), self._stack:  # what has been opened is left at rest
+                self._loop = None
             raise
 
     def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:

@@ -69,7 +69,7 @@ class VibrotactileRenderer(BaseRenderer):
         plate = getattr(driver, "plant", None)
         own = isinstance(plate, Plate) and plate.parameters is setup.simulated
         # that of a simulated plate may differ from what is assumed; a driver may state less than was identified
-        delay = assumed.delay if own else max(assumed.delay, driver.delay)
+        delay = assumed.delay if own else max(assumed.delay + getattr(driver, "host_delay", 0), driver.delay)
         model = replace(assumed.device_model(driver.rate, delay), block=driver.block)
         if gradient := setup.scene.gradient:  # of an amplitude 1 + gradient x: displacement at x is x_c + (x/a) a theta
             require(coils > 1, "gradient", gradient, "0 1/m: a plate with one coil moves as a whole")

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from importlib.metadata import version
 from pathlib import Path
 
@@ -82,6 +83,36 @@ def exports(tmp_path_factory):
     from laws import Exports
 
     return Exports(tmp_path_factory.mktemp("exports"))
+
+
+@pytest.fixture(scope="module")
+def jack_program(tmp_path_factory):
+    """The second client of `jack_ring`, compiled."""
+    import jack_ring
+
+    return jack_ring.build(tmp_path_factory.mktemp("jack"))
+
+
+@pytest.fixture(scope="module")
+def jack_server(tmp_path_factory):
+    """A JACK server with its dummy back end."""
+    import jack_ring
+
+    with jack_ring.server(tmp_path_factory.mktemp("server")):
+        yield
+
+
+@pytest.fixture
+def connected(jack_server, jack_program, tmp_path):
+    """Function that runs a system as the second client until the test ends."""
+    import jack_ring
+
+    with ExitStack() as stack:
+
+        def run(system, **options):
+            return stack.enter_context(jack_ring.device(jack_program, tmp_path, system, **options))
+
+        yield run
 
 
 @pytest.fixture(scope="session")

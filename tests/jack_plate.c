@@ -3,6 +3,7 @@
  * jack_plate CLIENT FILE: FILE holds four whole numbers (states, inputs, outputs, samples to record), the rms of the
  * noise in full scales, then A, B, C and D row by row.  Ports are in_1.. and out_1..  Commands on standard input:
  *   run N     go through N periods as fast as all clients can (freewheel)
+ *   free ON   1: go through periods as fast as all clients can, until 0
  *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
  *   stall MS  sleep once inside a period: the server reports an overrun
  *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
@@ -129,6 +130,7 @@ static void obey(char *line) {
     char name[4096];
     sscanf(line, "gain %lf %lf", &next_gain, &above);
     if (sscanf(line, "run %ld", &number) == 1) run(number);
+    if (sscanf(line, "free %ld", &number) == 1) jack_set_freewheel(client, (int)number);
     if (sscanf(line, "pace %ld", &number) == 1) atomic_store(&pace, number);
     if (sscanf(line, "stall %ld", &number) == 1) atomic_store(&stall, number);
     if (sscanf(line, "save %4095[^\n]", name) == 1) save(name);

@@ -171,6 +171,33 @@ def test_the_delay_is_the_cards_and_that_of_play():
     assert AudioDriver("0", delay=64, sensed_per_full_scale=1e-3).live().delay == 64
 
 
+@pytest.mark.parametrize("identified", [100, 128, 130])
+def test_a_profiles_delay_is_without_what_play_queues(identified):
+    """The loop is designed for the longer one of what is stated and what was identified, as the card has it."""
+    driver = AudioDriver("0", delay=128, sensed_per_full_scale=1e-3)
+    texture = hr.Grating(frequency=60.0, amplitude=1e-5)
+    scene = hr.Scene(texture=texture, profile={"rate": 48e3, "delay": identified}, duration=0.1)
+    models = [hr.prepare(scene, driver=each, compiled=False).model for each in (driver, driver.live())]
+    assert [each.delay for each in models] == [max(identified, 128) + driver.queued, max(identified, 128)]
+
+
+def test_block_and_rate_are_options_of_the_text():
+    """The advice names them too, quoted for a shell: a delay is that of a block and a rate."""
+    driver = open_driver("audio:usb?block=256&rate=44100&channels=3,4&latency=high&sensed_channels=1,&delay=300.5")
+    assert (driver.device, driver.block, driver.rate, driver.latency) == ("usb", 256, 44_100, "high")
+    assert (driver.channels, driver.inputs, driver.live().delay) == ((3, 4), (1,), 301)
+    assert str(driver) == "audio:usb?block=256&rate=44100"
+    with pytest.raises(DriverError, match=r"`hapticrender latency --driver 'audio:usb\?block=256&rate=44100' --out"):
+        driver.check_calibrated()
+    profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0})
+    assert open_driver("audio:0?drive_per_full_scale=1.5", profile).drive_limit == 1.5
+    assert str(open_driver("audio:0?block=64")) == "audio:0"
+    with pytest.raises(ValueError, match="driver = 'audio:0.blok=64': .*unexpected keyword argument 'blok'"):
+        open_driver("audio:0?blok=64")
+    with pytest.raises(ValueError, match="block='many' must be a whole number >= 1"):
+        open_driver("audio:0?block=many")
+
+
 @pytest.mark.parametrize(
     ("known", "unknown"), [({"sensed_per_full_scale": 1e-3}, "delay"), ({"delay": 128.0}, "sensed_per_full_scale")]
 )

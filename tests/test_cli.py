@@ -85,14 +85,6 @@ def process(*arguments, **options):
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
 
 
-def shell(line, folder, unbuffered="", **environment):
-    """A command line as a shell runs the console script, without the current folder on Python's path."""
-    root = str(Path(__file__).resolve().parent.parent)
-    environment = {**os.environ, "PYTHONPATH": root, "PYTHONUNBUFFERED": unbuffered, **environment}
-    command = ["bash", "-c", f"{sys.executable} -P -m hapticrender {line}"]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
-
-
 def complaint(result):
     """The one line of a refused command."""
     status, out, errors = result
@@ -158,6 +150,23 @@ def test_a_driver_is_chosen_by_name(run, tiny, tmp_path):
     assert out.startswith("tiny on vt-plate: not judged: the device has no sensors, so its motion is not measured\n")
     assert soundfile.info(played).samplerate == 48000
     assert not (tmp_path / "out" / "sensed.wav").exists()
+
+
+def test_a_file_is_played_live(run, tiny, tmp_path):
+    """What the page's recording has as drive is what the file has from where the recording began."""
+    played = tmp_path / "played.wav"
+    arguments = ["--out", tmp_path / "out", "--seconds", "0.2", "--driver", f"wavefile:{played}"]
+    status, out, _ = run("play", tiny, *arguments)
+    assert status == 0
+    assert "page: " in out
+    recording = Recording.load(tmp_path / "out" / "tiny" / "recording.au")
+    samples, rate = soundfile.read(played)
+    drive, n = recording.drive, len(recording)
+    assert rate == recording.rate
+    assert n >= 0.15 * rate
+    assert abs(drive).max() > 0.0
+    starts = range(len(samples) - n + 1)
+    assert any(abs(3.0 * samples[start : start + n] - drive).max() < 3.0 * 2.0**-23 for start in starts)
 
 
 RAISED = [
@@ -424,39 +433,6 @@ def test_a_closed_pipe_is_no_error():
         child.stdout.close()
         assert child.stderr.read() == ""
     assert child.returncode == 0
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no such redirections on this system")
-@pytest.mark.parametrize(("where", "status"), [("| true", 1), ("2>&1 | true", 1), ("> /dev/full", 2)])
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_status_and_reports_do_not_depend_on_the_output(tmp_path, tiny, where, status, unbuffered):
-    tiny.write_text(TINY.replace("0.1", "0.5") + "[render]\ntolerance = 1e-6\nsettle = 0.2\n")
-    done = shell(f"validate {tiny} --json r.json --junit r.xml {where}; exit ${{PIPESTATUS[0]}}", tmp_path, unbuffered)
-    assert (done.returncode, "Traceback" in done.stderr) == (status, False)
-    assert json.loads((tmp_path / "r.json").read_text())["scenes"][0]["verdict"] == "failed"
-    assert (tmp_path / "r.xml").exists()
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no such redirections on this system")
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
-def test_closed_streams_are_no_error(tmp_path, tiny, closed):
-    done = shell(f"render {tiny} --out out {closed}", tmp_path)
-    assert (done.returncode, "Traceback" in done.stderr) == (0, False)
-    assert {path.name for path in (tmp_path / "out").iterdir()} >= SCENE_FILES
-
-
-@pytest.mark.parametrize("verb", ["validate {}", "validate --suite accuracy modulation", "latency"])
-def test_a_driver_may_be_a_module_in_the_current_folder(tmp_path, tiny, verb):
-    """With -P, and so in the console script, that folder is no part of Python's path."""
-    (tmp_path / "mine.py").write_text("def driver(*_, **__):\n    return {}['it is there']\n")
-    done = shell(f"{verb.format(tiny)} --driver mine:driver", tmp_path)
-    assert "mine:driver: KeyError: 'it is there'" in done.stderr
-
-
-def test_kernels_are_not_played_by_python(tmp_path, tiny):
-    done = shell(f"render {tiny} --out out", tmp_path, NUMBA_DISABLE_JIT="1")
-    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
-    assert "NUMBA_DISABLE_JIT is set" in done.stderr
 
 
 values = st.one_of(

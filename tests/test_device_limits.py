@@ -11,6 +11,7 @@ from other_plate import OtherPlate
 from scipy.signal import lfilter
 
 import hapticrender as hr
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.renderers.limits import needed
 from hapticrender.touch.mechanics import HEAVY_SECOND
 from hapticrender.touch.recorded import Recorded
@@ -205,3 +206,19 @@ def test_a_hybrids_limits_are_those_of_its_plate():
     assert 0.2 - 2 * HALF_STEP < limited.model.plate.drive_limit <= 0.2
     with pytest.raises(ValueError, match=r"\[limits\] peak_drive"):
         hr.prepare(hr.Scene(**asked, device="hybrid", limits={"peak_drive": 0.001}))
+
+
+def hybrid(**profile):
+    texture = hr.Grating(frequency=250.0, velocity=10e-3)
+    return hr.Scene(texture=texture, finger=SLIDING, device="hybrid", duration=0.1, profile=profile)
+
+
+def test_a_hybrids_screen_is_limited_by_the_current_and_the_voltage_of_its_source():
+    """Both as peaks of the carrier, in [device]; the limiter holds what the square root takes them for."""
+    rendering = hr.prepare(hybrid())
+    shape, message = rendering.shape, r"texture.amplitude asks for an attraction of .* N: must be <= .* A"
+    assert rendering.model.friction.drive_limit == shape.bias - shape.floor
+    most = shape(shape.bias - shape.floor).item()
+    refused_beyond(lambda value: hybrid(screen_current_limit=value), most, message)
+    impedance = abs(ElectroadhesionParameters().impedance(0.5))
+    refused_beyond(lambda value: hybrid(voltage_limit=value), most * impedance, message)

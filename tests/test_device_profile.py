@@ -1,5 +1,7 @@
 """Profiles: TOML in and out, scenes that take them, whose overrides win, and runs that contradict them."""
 
+import re
+from contextlib import nullcontext
 from datetime import date
 
 import pytest
@@ -9,6 +11,7 @@ from hapticrender import cli
 from hapticrender.errors import SceneError
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.recordings.recording import Recording
+from hapticrender.touch.mechanics import HEAVY_SECOND
 from hapticrender.touch.scene import Scene
 
 PLATE = {
@@ -147,10 +150,67 @@ def test_identify_writes_a_profile_that_keeps_the_limits(plate, tmp_path, capsys
     assert "is the profile of a vt-plate, must be that of a ultrasonic" in capsys.readouterr().err
 
 
+STIFF = {"stiffness_1": 23.5e3, "stiffness_2": 24e3}
+CONTRADICTED = r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\): the"
+
+
 def test_a_profile_that_a_run_contradicts_is_named(plate):
-    stiff = {"stiffness_1": 23.5e3, "stiffness_2": 24e3}
-    with pytest.warns(hr.PlateMismatch, match=r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\): the"):
-        hr.render(hr.Scene(**fields(plate), simulation=stiff))
+    with pytest.warns(hr.PlateMismatch, match=CONTRADICTED):
+        hr.render(hr.Scene(**fields(plate), simulation=STIFF))
+
+
+@pytest.mark.parametrize(("simulation", "warned"), [(STIFF, CONTRADICTED), ({}, None)])
+@pytest.mark.parametrize("method", ["inverse", "h2"])
+def test_a_profile_that_live_play_contradicts_is_named_once_with_the_figure_of_render(
+    plate, tmp_path, simulation, warned, method
+):
+    """At the session's end, and in every recording; 11 % of stiffness are stated to 0.2, as `render` states them."""
+    scene = hr.Scene(**fields(plate), simulation=simulation, method=method)
+    with pytest.warns(hr.PlateMismatch) if warned else nullcontext():
+        rendered = hr.render(scene)
+    noted = pytest.warns(hr.PlateMismatch, match=warned) if warned else nullcontext()
+    with noted as caught, hr.Player(scene, paced=False) as player:
+        player.play(scene.texture)
+        player.record(tmp_path / "live.au")
+        player.sleep(2.0)
+        live = player.end_recording()
+    assert len(live.warnings) == len(rendered.warnings) == bool(warned)
+    if warned:
+        [warning] = caught
+        assert (str(warning.message),) == live.warnings
+        stated, expected = (
+            [float(x) for x in re.findall(r"([-+]?[\d.]+) %", each.warnings[0])] for each in (live, rendered)
+        )
+        assert stated == pytest.approx(expected, abs=0.2)
+
+
+def stop(player):
+    player.play(hr.Grating(frequency=143.0, amplitude=30e-6))
+    player.sleep(2.0)
+    raise KeyboardInterrupt
+
+
+def test_live_play_that_ctrl_c_ends_names_it_too(plate):
+    named, ended = pytest.warns(hr.PlateMismatch, match=CONTRADICTED), pytest.raises(KeyboardInterrupt)
+    with named, ended, hr.Player(str(plate), paced=False, simulation=STIFF) as player:
+        stop(player)
+
+
+@pytest.mark.parametrize(("device", "frequency"), [("vt-plate", 72.0), ("hybrid", 50.0)])
+def test_an_inner_damper_that_was_turned_down_is_named(device, frequency):
+    """Live and by `render`: a bending mode at 900 Hz that the model lacks; see `tests/test_supervisor.py`."""
+    bent = {"bending_frequency": 900.0, "bending_coil": -0.1}
+    fields = {"method": "h2", "simulation": bent}
+    texture = hr.Grating(frequency=frequency, amplitude=50e-6)
+    message = "inner damper rang above 500 Hz and was turned down to 0"
+    named = pytest.warns(hr.PlateMismatch, match=message)
+    with named, hr.Player(device, paced=False, **fields) as player:
+        player.finger(0.0, 0.0, 0.8)
+        player.play(texture)
+        player.sleep(2.0)
+    finger = hr.Finger.still(normal_load=0.8, touches=((0.5, 5.0),), mechanics=HEAVY_SECOND)
+    with pytest.warns(hr.PlateMismatch, match=message):
+        hr.render(hr.Scene(texture=texture, finger=finger, duration=2.0, device=device, **fields))
 
 
 def fields(plate):

@@ -18,7 +18,11 @@ from hapticrender.realtime_entry import CHANGE, RealtimeEntry
 from hapticrender.sampled_texture import SampledTexture
 
 RATE, SPEED, FULL = 5000.0, 0.08, 0.05  # Hz; m/s; s within which a texture is to be there
-SEED = 2  # the noise of one run is compared with that of another: three of five hold it
+TAIL = 0.05  # s: 4 to 8 periods
+SEEDS = range(4)
+QUIET = {"vt-plate": {"sensor_noise": 0.0}, "electroadhesion": {"force_noise": 0.0}} | dict.fromkeys(
+    ("ultrasonic", "hybrid"), {"sensor_noise": 0.0, "force_noise": 0.0}
+)
 KEPT = 600  # samples before a change
 CASES = {
     "plate, inverse": ("vt-plate", "inverse", {"frequency": 100.0}, {"frequency": 160.0}),
@@ -34,11 +38,6 @@ def grating(amplitude=5e-6, **carrier):
     return hr.Grating(amplitude=amplitude, **carrier)
 
 
-def opened(device, method):
-    noise = {"sensor_noise": 0.0} if device == "vt-plate" else {}
-    return hr.Player(device, paced=False, method=method, simulation=noise, seed=SEED)
-
-
 def played(player, seconds, start):
     """Play under a sliding finger, none on the plate; returns where it ends, the first sample, and all since `KEPT`."""
     first = player._loop.samples
@@ -50,39 +49,60 @@ def played(player, seconds, start):
     return start, first - began, signals
 
 
+def session(case, noise, seed, change):
+    """Play the new texture alone for 0.2 s, or 0.4 s after the old one: first sample, signals, flags, rate."""
+    device, method, old, new = CASES[case]
+    with hr.Player(device, paced=False, method=method, simulation=noise, seed=seed) as player:
+        player.finger(np.nan if device == "vt-plate" else -0.02, SPEED, 0.4)
+        player.play(grating(**(old if change else new)))
+        place, first, signals = played(player, 0.4 if change else 0.2, -0.02)
+        if change:
+            player.play(grating(**new))
+            _, first, signals = played(player, FULL + TAIL + 0.01, place)
+        return first, signals, player.state().flags, player._loop.driver.rate
+
+
 def largest_step(drive):
     return abs(np.diff(drive, axis=0)).max(axis=0)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_a_texture_is_there_within_50_ms_and_steps_no_more_than_at_a_start(case):
-    """Over whole periods of both textures from then on: within 5 %, law and mixture together; of the old one no more.
-
-    A converter rounds the plate's drive by a step either way.  Without the fades the drive would fall by its amplitude
-    in one sample, which is far above the bound.
-    """
-    device, method, old, new = CASES[case]
-    tail = 0.05  # s: 4 to 8 periods
-    with opened(device, method) as player:
-        player.finger(np.nan if device == "vt-plate" else -0.02, SPEED, 0.4)
-        player.play(grating(**new))
-        start = largest_step(played(player, 0.2, -0.02)[2]["drive"])
-    with opened(device, method) as player:
-        player.finger(np.nan if device == "vt-plate" else -0.02, SPEED, 0.4)
-        player.play(grating(**old))
-        place = played(player, 0.4, -0.02)[0]
-        player.play(grating(**new))
-        _, change, signals = played(player, FULL + tail + 0.01, place)
-        rate, flags = player._loop.driver.rate, player.state().flags
-    rounding = 0.02 * start  # of other noise
-    rounding[: 2 if device in ("vt-plate", "hybrid") else 0] = 2 * ROUNDING
-    drive, first = signals["drive"], change + round(FULL * rate)
-    assert (largest_step(drive[change - 1 :]) <= start + rounding).all()
-    assert (abs(drive[:change] - drive[:change].mean(axis=0)).max(axis=0) > start + rounding).any()
-    there = slice(first, first + round(tail * rate))
+def check_full(change, signals, flags, rate):
+    """Check that after 50 ms the new texture is there within 5 %, over whole periods of both textures, and no more."""
+    first = change + round(FULL * rate)
+    there = slice(first, first + round(TAIL * rate))
     reference, motion = (each - each.mean() for each in (signals["reference"][there], signals["motion"][there, 0]))
     assert np.sqrt(np.mean((motion - reference) ** 2)) < 0.05 * np.sqrt(np.mean(reference**2))
     assert not flags & (hr.Flag.SATURATED | hr.Flag.STOPPED)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_texture_is_there_within_50_ms_and_steps_no_more_than_at_a_start(case):
+    """Without noise; with that of four seeds a step is larger by five sigmas of what noise adds to a start's at most.
+
+    The sigma is that of all seeds from 50 to 200 ms after the start.  What fades out of the old texture counts as an
+    error for friction's law, which adds up to 1.2 % to the drive; a converter rounds the plate's by a step either way.
+    Without the fades the drive would fall by its amplitude in one sample, which is far above the bound.
+    """
+    device = CASES[case][0]
+    _, start, _, rate = session(case, QUIET[device], SEEDS[0], change=False)
+    change, *found = session(case, QUIET[device], SEEDS[0], change=True)
+    check_full(change, *found)
+    drive, quiet = found[0]["drive"], start["drive"]
+    more = 0.02 * largest_step(quiet)
+    more[: 2 if device in ("vt-plate", "hybrid") else 0] = 2 * ROUNDING
+    most = largest_step(quiet) + more
+    assert (largest_step(drive[change - 1 :]) <= most).all()
+    assert (abs(drive[:change] - drive[:change].mean(axis=0)).max(axis=0) > most).any()
+    if device == "vt-plate":
+        return
+    last = slice(-round((0.2 - FULL) * rate), None)
+    noisy = [session(case, {}, seed, change=False)[1]["drive"] for seed in SEEDS]
+    sigma = np.std([np.diff((each - quiet)[last], axis=0) for each in noisy], axis=(0, 1))
+    assert sigma.all()
+    for seed in SEEDS:
+        change, *found = session(case, {}, seed, change=True)
+        check_full(change, *found)
+        assert (largest_step(found[0]["drive"][change - 1 :]) <= most + 5 * sigma).all()
 
 
 @pytest.mark.parametrize("driver", [None, Screen(blind=False, finger=hr.Finger.sliding(SPEED, 0.4, span=0.2))])

@@ -18,6 +18,7 @@ FAULTS = {  # what is sensed instead of `sensed`, of which `last` was the last s
     "dead": lambda sensed, last, rng: 0.0 * sensed,
     "no numbers": lambda sensed, last, rng: np.nan * sensed,
     "inverted": lambda sensed, last, rng: -sensed,
+    "gain of 3": lambda sensed, last, rng: 3.0 * sensed,
     "noise": lambda sensed, last, rng: 1e-9 * rng.standard_normal(sensed.shape),
 }
 
@@ -57,6 +58,7 @@ STOPPED = [  # and within which time (s)
     ("ultrasonic", "dead", 0.1e-3, "one value repeats"),
     ("ultrasonic", "no numbers", 8e-3, "samples are no numbers"),
     ("ultrasonic", "inverted", 4e-3, "the drive stayed above what any finger needs"),
+    ("ultrasonic", "gain of 3", 4e-3, "the drive stayed above what any finger needs"),
     ("ultrasonic", "noise", 4e-3, "the drive stayed above what any finger needs"),
     ("electroadhesion", "frozen", 8e-3, "one value repeats"),
     ("electroadhesion", "dead", 8e-3, "one value repeats"),
@@ -89,16 +91,19 @@ def test_a_sensor_that_fails_is_stopped(kind, fault, within, cause):
         assert after < before + slope * (found.time - START + ZERO / 10)
 
 
-@pytest.mark.parametrize(("fault", "verdict"), [("healthy", "passed"), ("inverted", "passed"), ("noise", "failed")])
-def test_a_tribometer_that_is_inverted_or_dies_into_noise_is_not_stopped(fault, verdict):
-    """Friction is a magnitude; of noise nothing is found, and the square root bounds the drive."""
+NOT_STOPPED = {"healthy": "passed", "inverted": "passed", "noise": "failed", "gain of 3": "failed"}
+
+
+@pytest.mark.parametrize(("fault", "verdict"), NOT_STOPPED.items())
+def test_a_tribometer_that_is_inverted_or_triples_or_dies_into_noise_is_not_stopped(fault, verdict):
+    """Friction is a magnitude; of noise and another gain nothing is found, and the square root bounds the drive."""
     device, scene, recording, found = run("electroadhesion", fault)
     assert found is None
     assert recording.summary()["verdict"] == verdict
     shape = hr.prepare(scene, driver=spoiled("electroadhesion", fault)).driver.shape
     before, after = largest(device.played, device.rate)
     assert after <= shape(shape.bias - shape.floor) < 1.2 * before
-    if fault != "noise":
+    if verdict == "passed":
         assert after == pytest.approx(before, rel=0.01)
 
 

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from live_devices import Told
+from strangers_plate import StrangersPlate
 
 import hapticrender as hr
 from hapticrender import loop
@@ -218,3 +219,34 @@ def test_motion_that_a_device_states_and_then_does_not_is_refused(run):
     with pytest.raises(hr.ProtocolError, match="Told: play: motion is None, and was stated before: must be"):
         run(driver=driver)
     assert len(driver.played) == 1001 + 1  # and zero drive
+
+
+class LateHost(StrangersPlate):
+    """A plate whose host computes drive 192 samples ahead; blocks with which it is late are zeros, and flagged."""
+
+    host_delay, ahead = 192, 2  # samples; blocks that wait, beside the one that is computed
+
+    def __init__(self, late, seed):
+        super().__init__(rate=48e3, block=64, told=320, delay=320 - 64 + 1, seed=seed)
+        self.late, self.number = late, -1
+
+    def play(self, drive):
+        self.number += 1
+        sensed = super().play(0.0 * drive if self.number + self.ahead in self.late else drive)
+        flags = np.full(64, int(hr.Flag.OVERRUN) if self.number in self.late else 0)
+        return hr.Sensed(sensed.sensed, flags=flags)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_host_that_is_late_is_not_taken_for_a_fault_of_the_device(seed):
+    """Up to 32 blocks at a time, at four moments, the start among them; a device that is inverted is stopped."""
+    rng = np.random.default_rng(seed)
+    begin = [1, *rng.integers(20, 400, 3)]
+    late = {number for first in begin for number in range(first, first + int(rng.integers(16, 33)))}
+    scene = hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=10e-6), duration=0.6)
+    recording = hr.render(scene, driver=LateHost(late, seed))
+    assert np.count_nonzero(recording.flags & hr.Flag.OVERRUN) == 64 * len(late & set(range(450)))
+    wrong = LateHost(late, seed)
+    wrong.true["gain_1"] = wrong.true["gain_2"] = -1.0
+    with pytest.raises(hr.DeviceFault, match=r"\d{3,4} of the \d{4} samples until then were lost, .*; found was: "):
+        hr.render(scene, driver=wrong)

@@ -1,5 +1,8 @@
 """Live play: what plays is the texture, whatever changes on the way, and whoever drives the device."""
 
+import re
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -348,3 +351,14 @@ def test_the_finger_of_a_scene_is_sent_to_a_device_that_does_not_sense_it():
     off = abs(played["position"] - scene.finger.position(time))[1000:]
     assert np.median(off) < 1e-3  # a loaded machine sends them late
     assert np.isfinite(played["position"][1000:]).all()
+
+
+def test_the_benchmark_of_live_play_prints_every_figure():
+    """Errors and samples repeat: those of one of its sessions are within the worst that ``docs/live.md`` states."""
+    command = [sys.executable, "-m", "benchmarks.live", "--calls", "20", "--sessions", "1"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240).stdout.splitlines()
+    assert len(printed) == 11
+    assert [re.search(r"[\d.]+ %", line) is not None for line in printed] == [True] * 4 + [False] * 2 + [True] * 5
+    assert 64 < int(re.search(r"(\d+) samples later", printed[4])[1]) < 128  # a block, and less than another one
+    for line, most in zip(printed[6:], (1.1, 6.6, 3.2, 3.6, 1.8), strict=True):
+        assert float(re.search(r"([\d.]+) / ", line)[1]) < most

@@ -11,6 +11,7 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender.drivers.serial import SerialDriver
+from hapticrender.recordings.recording import Recording
 
 WHITE = hr.Recorded(
     samples=np.random.default_rng(5).standard_normal(20_000), rate=5000.0, gain=10e-6, passband=(30.0, 300.0)
@@ -93,6 +94,27 @@ def test_a_board_that_is_found_again_is_recorded_again(program, tmp_path):
             recording = player.end_recording()
     parts = [phasor(each[-1500:], 100.0) for each in (recording.reference, recording.motion[:, 0])]
     assert abs(parts[1] - parts[0]) < 0.05 * 5e-6  # the new run's carriers begin anew, and so does the texture
+
+
+def unplug(board, player, path):
+    player.play(TONE)
+    player.record(path)
+    player.sleep(0.3)
+    board.kill()
+    player.sleep(10.0)
+
+
+def test_a_board_that_is_pulled_is_lost_with_port_operation_and_bytes(program, tmp_path):
+    """Without `reconnect`; its recording ends with a sample of zero drive and a stop."""
+    lost = pytest.raises(hr.DeviceLost, match=r"tty: (line|listen): .* \(\d+ bytes sent, \d+ received, 0 bad frames\)")
+    with BoardProcess(program, tmp_path, *SLOW) as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        with lost, hr.Player(driver=driver) as player:
+            unplug(board, player, tmp_path / "board.au")
+    recording = Recording.load(tmp_path / "board.au")
+    assert recording.drive[:-1].any()
+    assert recording.flags[-1] == hr.Flag.STOPPED
+    assert not recording.drive[-1].any()
 
 
 def test_the_board_stops_when_the_application_is_silent(program, tmp_path):

@@ -151,6 +151,29 @@ class Rewired(Watched):
         return super().play(drive)
 
 
+@pytest.mark.parametrize("blocks", [faults.BLOCKS, faults.CARD], ids=["25 at 5 kHz", "64 at 48 kHz"])
+@pytest.mark.parametrize("which", ["both", "one"])
+@pytest.mark.parametrize("frequency", [20.0, 189.0])
+def test_a_buffer_that_repeats_stops_the_drive(blocks, which, frequency):
+    """A block and 2 ms at least; and until drives of two blocks differ by what moves a sensor, four blocks or more."""
+    plate = faults.PLATES["wrong"](*faults.FAULTS[f"buffer repeats, {which}"], 0.8, 0.0, **blocks)
+    stopped, _, motion, message = faults.run(plate, hr.Grating(frequency=frequency, amplitude=50e-6))
+    assert blocks["block"] / plate.rate <= stopped <= 20e-3
+    assert motion < 250e-6  # as frozen
+    assert f"sensor {'1 and 2' if which == 'both' else '1'}: one value repeats, or one block" in message
+
+
+@pytest.mark.parametrize("frequency", [200.0, 400.0])
+def test_a_texture_that_repeats_itself_in_every_block_plays_on(frequency):
+    """Without noise a converter then shows the same 25 values again and again."""
+    plate = StrangersPlate(noise=0.0, block=25, told=25, sensor_bits=12)
+    recording = hr.render(
+        hr.Scene(texture=hr.Grating(frequency=frequency, amplitude=50e-6), duration=1.0), driver=plate
+    )
+    blocks = recording.sensed[-1000:].reshape(-1, 25, 2)
+    assert (blocks[1:] == blocks[:-1]).mean() > 0.9
+
+
 @TUNED
 @pytest.mark.parametrize("change", CHANGES)
 def test_a_gain_that_changes_during_a_run_stops_the_drive_and_is_named(change, frequency, truth):

@@ -160,6 +160,11 @@ class CombinedController(Addressed):
         return max((part.mismatch for part in self.parts if part is not None), default=0.0)
 
     @property
+    def damper_scale(self) -> float:
+        """Least gain to which a ringing inner damper of a part has been turned down; see `SupervisedController`."""
+        return min(getattr(part, "damper_scale", 1.0) for part in self.parts)
+
+    @property
     def fault(self) -> Fault | None:
         """Why and when the drive of a part has been stopped; see `SupervisedController`."""
         parts: tuple[Any, ...] = self.parts

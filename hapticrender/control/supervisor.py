@@ -81,7 +81,7 @@ CAUSES = {
         "cable and supply, and that the surface stays within the range",
     ),
     FROZEN: (
-        "sensor {sensor}: one value repeats while the drive moves; most likely frozen or disconnected",
+        "sensor {sensor}: one value repeats, or one block, while the drive moves; most likely frozen or disconnected",
         "cable, supply and converter",
     ),
     INCONSISTENT: (
@@ -139,6 +139,7 @@ class SupervisedController(Addressed):
         self.state = np.zeros(1, SUPERVISOR)
         supervised_step.expect()
         self._forces = np.zeros((model.delay + 1, 3))
+        self._frame = np.full((model.block, MOST_SENSORS, 2), np.nan)
         settings = design_supervisor(controller, model)
         found = design_gains(model, sensor_noise(model)) if settings.get("modelled") else None
         self.gains = np.zeros(1, GAINS) if found is None else found
@@ -146,6 +147,7 @@ class SupervisedController(Addressed):
             "step": controller.step.address,
             "state": controller.state.ctypes.data,
             "forces_at": self._forces.ctypes.data,
+            "frame_at": self._frame.ctypes.data,
             "gains": 0 if found is None else self.gains.ctypes.data,
         }
         for name, value in settings.items():
@@ -170,6 +172,10 @@ class SupervisedController(Addressed):
     def damper_scale(self) -> float:
         """Gain to which a ringing inner damper has been turned down, 1: it did not ring."""
         return float(self.state["damper_scale"][0])
+
+    def unplayed(self, samples: Array) -> None:
+        """Compare motion with no drive where that which acts so many samples from now on was not played."""
+        self._forces[(self.state["now"] + samples) % len(self._forces)] = 0.0
 
     run = BankController.run
 
@@ -223,6 +229,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "sensors": sensors,
         "channels": channels,
         "block": getattr(controller, "block", 1),
+        "frame": model.block,
         "delay": model.delay,
         "needs_contact": model.finger.needs_contact,
         "sensor_limit": model.sensed_limit,

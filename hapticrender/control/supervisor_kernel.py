@@ -10,7 +10,8 @@ no  cause        condition                                                      
 === ============ ================================================================================ ====================
 1   invalid      share of samples that are not finite or not inside the range > 0.3               20 ms (mean)
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
-                 before (or 10 ms), while the drive moves                                         at once
+                 before (or 10 ms), while the drive moves; or the device's last block of samples,
+                 for as many samples, and 2 ms, while the drive does not repeat itself            at once
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
                  or > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s ("slowly")       0.3 s
@@ -79,6 +80,7 @@ SETTINGS = np.dtype(
         *((f"{name}_time", np.int64) for name in _TIMES),
         *((name, np.int64) for name in ("step", "state", "controller", "modelled", "sensors", "channels", "block")),
         *((name, np.int64) for name in ("delay", "needs_contact", "forces_at", "limited", "gains")),
+        *((name, np.int64) for name in ("frame", "frame_at")),
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
@@ -96,14 +98,34 @@ SUPERVISOR = np.dtype(
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
-        *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most")),
-        *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest")),
+        *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most", "least_change", "most_change")),
+        *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest", "frame_repeats")),
         *((f"{name}_count", np.int64) for name in COUNTS),
         *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
         ("compared", np.int64),  # whether motion and drive were compared in the last sample
     ]
 )
 SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
+
+
+@kernel
+def repeats_frame(supervisor, i, value, drive):
+    """Whether sensor `i` shows the device's last block (`frame` samples) again, while the sum of the drive differs.
+
+    A texture of that period repeats itself too, and is none.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, count, least, most = s.p, s.frame_repeats, s.least_change, s.most_change
+    frame = carray(pointer(p.frame_at, F8), (p.frame, MOST_SENSORS, 2))
+    row = s.sample % p.frame
+    change = drive - frame[row, i, 1]
+    if value == frame[row, i, 0] and change == change:
+        count[i] += 1
+        least[i], most[i] = min(least[i], change), max(most[i], change)
+    else:
+        count[i], least[i], most[i] = 0, 0.0, 0.0
+    frame[row, i, 0], frame[row, i, 1] = value, drive
+    return count[i] >= max(p.frame, p.frozen_time) and most[i] - least[i] > p.frozen_drive
 
 
 @kernel
@@ -129,6 +151,8 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         else:
             longest[i] = max(longest[i], repeats[i])
             last[i], repeats[i], least[i], most[i] = value, 1, drive, drive
+        if p.frame > 1 and repeats_frame(supervisor, i, value, drive if acts else np.nan):
+            frozen |= 1 << i
         if p.sensor_limit > abs(value) > p.sensed_bound:
             beyond |= 1 << i
         q0 += shows[0, i] * last[i]

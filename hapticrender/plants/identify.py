@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -51,6 +52,7 @@ RAMP = 0.05  # s: fade-in and fade-out of the drive
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
+TRIES = 10  # where samples are lost
 CONTACT = 0.05  # N: largest static load
 SIGNIFICANT = 2.0  # half-widths of the 95 % interval: exceeded by chance once in 10 000 numbers
 TOLERABLE = MappingProxyType(  # relative, delay in samples: differences that the controller takes without a warning
@@ -62,6 +64,10 @@ TOLERABLE = MappingProxyType(  # relative, delay in samples: differences that th
         **dict(zip(BENDING, (0.02, 0.5, 0.2), strict=True)),
     }
 )
+
+
+class SamplesLost(DesignError):
+    """Samples were lost on the way."""
 
 
 class Estimate(NamedTuple):
@@ -322,9 +328,18 @@ def _whole_drive(sine: Multisine, start: int, fade: int) -> Array:
 def play(driver: Driver, drive: Array) -> Sensed:
     """Play `drive` (n, channels) in blocks, then at least a block of zeros; return what was sensed of it.
 
-    A `DesignError` where the device reports a saturated drive, a clipped sensor or lost samples, a `DriverError` where
-    it failed; after either, zero drive was sent if it still took any.
+    It is played again, up to `TRIES` times, where samples are lost.  A `DesignError` where they were lost every time,
+    or the device reports a saturated drive or a clipped sensor, a `DriverError` where it failed; after either, zero
+    drive was sent if it still took any.
     """
+    for _ in range(TRIES - 1):
+        with suppress(SamplesLost):
+            return _play_once(driver, drive)
+    return _play_once(driver, drive)
+
+
+def _play_once(driver: Driver, drive: Array) -> Sensed:
+    """As `play`; a `SamplesLost` where samples were lost."""
     n, block = len(drive), driver.block
     padded = np.concatenate([drive, np.zeros((-n % block + block, drive.shape[1]))])
     kept = []
@@ -334,9 +349,11 @@ def play(driver: Driver, drive: Array) -> Sensed:
             given = Sensed(played.sensed, played.position, normal_load=played.normal_load, flags=played.flags)
             sensed = check_sensed(driver, given, 0)
             raised = Flag(0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
-            if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED | Flag.OVERRUN):
-                cure = "free the computer, or take a larger block" if raised & Flag.OVERRUN else "decrease amplitude"
-                raise DesignError(f"sample {start}: the device reports {raised.name}: {cure}")
+            if raised & Flag.OVERRUN:
+                cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and sound server)"
+                raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
+            if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
+                raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
         try:
