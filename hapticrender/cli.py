@@ -55,8 +55,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has closed it, as in `hapticrender scenes | head -1`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except KeyboardInterrupt:
-        return verbs.fail("interrupted; what is written so far can be read", 130)
+    except KeyboardInterrupt as error:
+        notes = getattr(error, "__notes__", ["what is written so far can be read"])
+        return verbs.fail("; ".join(["interrupted", *notes]), 130)
     except (MemoryError, OSError, ValueError, HapticError) as error:
         if sys.flags.dev_mode:
             traceback.print_exception(error)
@@ -68,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> int:
     try:
         return arguments.run(arguments)  # type: ignore[no-any-return]
     except SystemExit as error:
-        from hapticrender.loop import Terminated
+        from hapticrender.process_signals import Terminated
 
         if isinstance(error, Terminated):
             raise

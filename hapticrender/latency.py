@@ -13,7 +13,8 @@ for in the loop's models a drive is held for a sample, and so acts half a sample
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterator
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +23,7 @@ import numpy as np
 
 from hapticrender.devices import open_driver
 from hapticrender.errors import DriverError
+from hapticrender.loop import opened as open_at_rest
 from hapticrender.protocols import Array, Flag
 from hapticrender.touch.device_profile import DeviceProfile
 
@@ -105,13 +107,14 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
     rng, trips, tries = np.random.default_rng(0), [], 0
-    for opened in _opened(driver):
-        tries += 1
-        trip = _trip(opened, amplitude, rng)
-        if trip is not None:
-            trips.append(trip)
-        if len(trips) == runs or tries == TRIES * runs:
-            break
+    with closing(_opened(driver)) as drivers:
+        for opened in drivers:
+            tries += 1
+            trip = _trip(opened, amplitude, rng)
+            if trip is not None:
+                trips.append(trip)
+            if len(trips) == runs or tries == TRIES * runs:
+                break
     name = f"{driver}: latency"
     if len(trips) < runs:
         raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
@@ -131,15 +134,15 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     return found
 
 
-def _opened(driver: Any) -> Iterator[Any]:
+def _opened(driver: Any) -> Generator[Any, None, None]:
     """Open drivers for one run after the other: new ones where it makes them, otherwise the same again and again."""
     if hasattr(driver, "loop_back"):
         while True:
-            with driver.loop_back() as opened:
+            with open_at_rest(each := driver.loop_back(), each) as opened:
                 yield opened
     if not driver.sensed_channels:
         raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
-    with driver:
+    with open_at_rest(driver, driver):
         while True:
             yield driver
 

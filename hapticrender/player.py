@@ -32,14 +32,14 @@ import numpy as np
 from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
-from hapticrender.driver_checks import opened_once
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, zero_drive_after
+from hapticrender.loop import opened, play_zeros, prepare, recorder_of
 from hapticrender.player_state import BandState, PlayerState
+from hapticrender.process_signals import signals_wait, stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
@@ -116,14 +116,12 @@ class Player(Addressed):
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
-        self._motion = LiveMotion()
+        self._motion, self._playlist = LiveMotion(), LivePlaylist()
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
         self._loop: LiveLoop | None = None
-        self._gain, self._lost = 1.0, 0
-        self._playlist = LivePlaylist()
+        self._gain, self._lost, self._raised = 1.0, 0, False
         self._error: BaseException | None = None
-        self._raised = False
         self._recorder: Recorder | None = None
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls = 0  # of the application that are under way
@@ -137,6 +135,7 @@ class Player(Addressed):
 
     def __enter__(self) -> Self:
         self._entered = True
+        self._stack.enter_context(stopped_by_signal())
         atexit.register(self.__exit__, None, None, None)  # where the program ends before its `with` does
         return self
 
@@ -144,10 +143,10 @@ class Player(Addressed):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
-        atexit.unregister(self.__exit__)
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        with ExitStack() as last:  # from the last to the first, whatever fails
+        with stopped_by_signal(), signals_wait(), ExitStack() as last:  # from the last to the first, whatever fails
+            last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened
                 self._entered = False
@@ -158,6 +157,10 @@ class Player(Addressed):
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
             raise HapticError(slow)
+        if self._unwritten is not None:
+            if error is None:
+                raise self._unwritten
+            error.add_note(f"and the recording is not whole: {self._unwritten}")
 
     @property
     def time(self) -> float:
@@ -251,7 +254,7 @@ class Player(Addressed):
             bands = replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=())
             recorder = recorder_of(rendering, path, scene=scene, bands=bands)
             recorder.begin()
-            self._recorder, self._unwritten = recorder, None
+            self._recorder = recorder
 
     def end_recording(self) -> Recording:
         """End the recording and return it."""
@@ -261,9 +264,9 @@ class Player(Addressed):
             if self._recorder is None:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()
-            recorder, self._recorder = self._recorder, None
-            if self._unwritten is not None:
-                raise self._unwritten
+            recorder, unwritten, self._recorder, self._unwritten = self._recorder, self._unwritten, None, None
+            if unwritten is not None:
+                raise unwritten
             return recorder.finish()
 
     def state(self) -> PlayerState:
@@ -369,11 +372,7 @@ class Player(Addressed):
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
         if self._given is None and rendering.plant is not None:
             self._motion.attach(rendering)
-        stack.enter_context(opened_once(device))
-        stack.enter_context(stopped_by_signal())
-        rendering.driver.__enter__()
-        stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
-        stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
+        stack.enter_context(opened(rendering.driver, device, self._threads.hanging.is_set))
         if rendering.probe is not None:
             rendering.probe(device)
         self._loop = loop
@@ -475,8 +474,7 @@ class Player(Addressed):
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""
-        loop = self._loop
-        if loop is None:
+        if (loop := self._loop) is None:
             return
         running = self._paced and self._error is None
         with self._lock:
@@ -496,5 +494,7 @@ class Player(Addressed):
 
     def _close_recorder(self, stopped: bool) -> None:
         if self._recorder is not None:
-            with suppress(OSError):
+            try:
                 self._recorder.close(stopped)
+            except OSError as error:
+                self._unwritten = self._unwritten or error

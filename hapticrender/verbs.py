@@ -122,6 +122,7 @@ def play(arguments: argparse.Namespace) -> int:
     journal, above, second = None, 0, 0
     try:
         with (
+            outputs.naming_full(out or ""),
             naming_driver(arguments.driver),
             naming(arguments.scene),
             Player(scene, _driver(arguments.driver, scene, arguments.force)) as player,
@@ -237,6 +238,7 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.plants.identify_friction import identify_resonance, identify_screen
     from hapticrender.plants.plate import Plate
     from hapticrender.plants.ultrasonic import UltrasonicPlate
+    from hapticrender.process_signals import stopped_by_signal
     from hapticrender.report.outputs import check_file
     from hapticrender.touch.finger import Finger
 
@@ -244,7 +246,7 @@ def identify(arguments: argparse.Namespace) -> int:
         check_file("--out", arguments.out)
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
     found: Any
-    with naming_driver(arguments.driver), naming(arguments.scene or "identify"):
+    with stopped_by_signal(), naming_driver(arguments.driver), naming(arguments.scene or "identify"):
         if scene.device not in ("vt-plate", "ultrasonic", "electroadhesion"):
             raise ValueError(f"device.kind = {scene.device!r}: must be vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
