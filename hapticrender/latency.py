@@ -13,8 +13,6 @@ for in the loop's models a drive is held for a sample, and so acts half a sample
 from __future__ import annotations
 
 import statistics
-from collections.abc import Generator
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -106,15 +104,18 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
         raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
-    rng, trips, tries = np.random.default_rng(0), [], 0
-    with closing(_opened(driver)) as drivers:
-        for opened in drivers:
-            tries += 1
-            trip = _trip(opened, amplitude, rng)
-            if trip is not None:
-                trips.append(trip)
-            if len(trips) == runs or tries == TRIES * runs:
-                break
+    again = hasattr(driver, "loop_back")  # a new driver for every run
+    if not (again or driver.sensed_channels):
+        raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
+    rng, trips, tries = np.random.default_rng(0), list[Trip](), 0
+    while len(trips) < runs and tries < TRIES * runs:
+        with open_at_rest(made := driver.loop_back() if again else driver, made) as opened:
+            for _ in range(1 if again else TRIES * runs):
+                tries += 1
+                if trip := _trip(opened, amplitude, rng):
+                    trips.append(trip)
+                if len(trips) == runs:
+                    break
     name = f"{driver}: latency"
     if len(trips) < runs:
         raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
@@ -132,19 +133,6 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
             "programs that use the card, or use larger blocks"
         )
     return found
-
-
-def _opened(driver: Any) -> Generator[Any, None, None]:
-    """Open drivers for one run after the other: new ones where it makes them, otherwise the same again and again."""
-    if hasattr(driver, "loop_back"):
-        while True:
-            with open_at_rest(each := driver.loop_back(), each) as opened:
-                yield opened
-    if not driver.sensed_channels:
-        raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
-    with open_at_rest(driver, driver):
-        while True:
-            yield driver
 
 
 def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | None:

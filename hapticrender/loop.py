@@ -25,7 +25,7 @@ from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
-from hapticrender.process_signals import ended_with_program, signals_wait, stopped_by_signal
+from hapticrender.process_signals import ended_with_program, stopped_by_signal
 from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import refuse_to_overwrite
@@ -249,7 +249,7 @@ def opened(driver: Any, device: Driver, hangs: Callable[[], bool] = lambda: Fals
         entered = driver.__enter__()
         stack.push(lambda *error: None if hangs() else driver.__exit__(*error))
         stack.push(lambda kind, error, _: _rest(device, error, hangs))
-        stack.callback(lambda: waiting.enter_context(signals_wait()))
+        stack.callback(lambda: waiting.enter_context(stopped_by_signal(wait=True)))
         yield entered
 
 

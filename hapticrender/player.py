@@ -39,7 +39,7 @@ from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
 from hapticrender.loop import opened, play_zeros, prepare, recorder_of
 from hapticrender.player_state import BandState, PlayerState
-from hapticrender.process_signals import signals_wait, stopped_by_signal
+from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
@@ -145,7 +145,7 @@ class Player(Addressed):
         """Zero drive, then close the device and the recording; a fault that nobody has seen is raised."""
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        with stopped_by_signal(), signals_wait(), ExitStack() as last:  # from the last to the first, whatever fails
+        with stopped_by_signal(wait=True), ExitStack() as last:  # from the last to the first, whatever fails
             last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened

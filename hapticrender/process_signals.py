@@ -1,7 +1,6 @@
-"""Signals that end the process: Ctrl-C, SIGTERM, SIGHUP.
+"""Signals that end the process, which Python handles in the main thread.
 
-Python runs their handlers in the main thread, and lets only that one set them.  The first signal raises an exception
-there; further ones wait until what plays is at rest and closed.
+The first one raises an exception there; further ones wait until what plays is at rest and closed.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
-DEFAULT: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}  # what they do otherwise
+DEFAULT: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}  # Ctrl-C; what they do otherwise
 DEFAULT |= {getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)}
 GUARDED: list[BaseException | None] = []  # for each guard that is open, the exception that was handled as it opened
 CLOSING: list[None] = []  # an entry for each device that is being set to rest
@@ -31,9 +30,9 @@ def _error(number: int) -> BaseException:
 
 
 def _end(number: int, frame: object) -> None:
-    """Handle a signal: raise its exception, unless an earlier one is on its way, or a device is being set to rest."""
+    """Raise the exception of a signal; not while that of an earlier one is handled, or a device is set to rest."""
     error = sys.exception()
-    if not GUARDED:  # the last guard was closed by another thread, which cannot restore what was there before
+    if not GUARDED:  # the last guard was closed by another thread, which may not restore the handler
         signal.signal(number, DEFAULT[number])
         signal.raise_signal(number)
     elif CLOSING or (isinstance(error, KeyboardInterrupt | Terminated) and error not in GUARDED):
@@ -42,51 +41,39 @@ def _end(number: int, frame: object) -> None:
         raise _error(number)
 
 
-def _main() -> bool:
-    return threading.current_thread() is threading.main_thread()
+def _exchange(old: dict[int, Any], new: dict[int, Any]) -> None:
+    """Replace handlers; those of somebody else, as of `nohup`, stay, and so do all in another thread than the main."""
+    with suppress(ValueError):
+        for each in old:
+            if signal.getsignal(each) is old[each]:
+                signal.signal(each, new[each])
 
 
 @contextmanager
-def stopped_by_signal() -> Iterator[None]:
-    """Turn the signals of `DEFAULT` into exceptions in the main thread; may be nested, or overlap.
-
-    One that somebody else handles, or that `nohup` ignores, is left alone, and so are all where another thread enters.
-    """
-    ours = [each for each in DEFAULT if _main() and signal.getsignal(each) in (DEFAULT[each], _end)]
-    if not ours:
-        yield
-        return
-    GUARDED.append(own := sys.exception())
-    for each in ours:
-        signal.signal(each, _end)
+def stopped_by_signal(wait: bool = False) -> Iterator[None]:
+    """Turn signals into exceptions where the main thread enters; may be nested, or overlap; or let them `wait`."""
+    own, waits, ours = sys.exception(), [None] * wait, dict.fromkeys(DEFAULT, _end)
+    _exchange(DEFAULT, ours)
+    GUARDED.append(own)
+    CLOSING.extend(waits)
     try:
         yield
     finally:
+        del CLOSING[: len(waits)]
         GUARDED.remove(own)
-        for each in DEFAULT if _main() and not GUARDED else ():
-            if signal.getsignal(each) is _end:
-                signal.signal(each, DEFAULT[each])
-        if WAITING:
+        if not GUARDED:
+            _exchange(ours, DEFAULT)
+        if WAITING and not CLOSING:
             number = WAITING.pop()
             WAITING.clear()
-            if _main():
+            if threading.current_thread() is threading.main_thread():
                 raise _error(number)
             signal.raise_signal(number)
 
 
 @contextmanager
-def signals_wait() -> Iterator[None]:
-    """Let signals wait until the guard is closed."""
-    CLOSING.append(None)
-    try:
-        yield
-    finally:
-        CLOSING.pop()
-
-
-@contextmanager
 def ended_with_program() -> Iterator[threading.Event]:
-    """Set an event where the program ends before what is within, in a daemon thread, and wait for that to end."""
+    """Set an event where the program ends before what is within, in a daemon thread, and wait until that has ended."""
     ending, ended = threading.Event(), threading.Event()
 
     def end() -> None:
