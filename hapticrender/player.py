@@ -60,7 +60,8 @@ TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up; with
 class Player(Addressed):
     """Plays textures on a device while the application goes on; used in a `with` statement.
 
-    Its methods may be called from any thread; `finger` never waits for the others.
+    Its methods may be called from any thread; `finger` never waits for the others.  Signals that end the process leave
+    zero drive where the `with` is entered in the main thread; elsewhere the application handles them (docs/live.md).
 
     Parameters
     ----------
@@ -80,9 +81,8 @@ class Player(Addressed):
         permanently, within 10 ms; 0.1 to 60, and at least two blocks of the driver; inf: never.  `sleep` counts as
         calls.  Unless it is given: 5 s (and two blocks) while a finger that `finger` has set touches the surface.
     **tables
-        Further fields of the scene, in place of a scene's own: profile, simulation, rendering, method, seed.  No
-        touch_panel: that of a scene locates the finger that moves by itself, and positions passed to `finger` are taken
-        as they are.
+        Further fields of the scene, in place of its own: profile, simulation, rendering, method, seed.  No touch_panel:
+        that of a scene locates the finger that moves by itself; positions passed to `finger` are taken as they are.
 
     Raises
     ------
