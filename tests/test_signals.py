@@ -102,12 +102,19 @@ def test_signals_wait_until_a_device_is_at_rest(how, struck, defaults):
     assert not plate.is_open
 
 
+def test_a_plate_that_the_application_has_opened_is_left_at_zero_drive_by_identify(defaults):
+    with struck("TERM,,") as plate, pytest.raises(Terminated):
+        hr.identify(plate, PlateParameters())
+    assert plate.driven == 20
+    assert not plate.played[-1].any()
+
+
 @pytest.mark.parametrize("verb", ["identify", "latency"])
 @pytest.mark.parametrize(("name", "status"), [("INT", 130), ("TERM", 143), ("HUP", 129)])
 def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tmp_path):
-    """With the exit status that every verb has."""
+    """With the exit status that every verb has, also where the signal comes again while it closes the driver."""
     log = tmp_path / "played"
-    command = [sys.executable, "-m", "hapticrender", verb, "--driver", f"test_signals:struck:{name},,{log}"]
+    command = [sys.executable, "-m", "hapticrender", verb, "--driver", f"test_signals:struck:{name},{name},{log}"]
     default = partial(signal.signal, getattr(signal, f"SIG{name}"), signal.SIG_DFL)
     ended = run(command, preexec_fn=default)
     assert ended.returncode == status, ended.stderr
@@ -190,5 +197,5 @@ def test_an_application_that_catches_ctrl_c_gets_the_next_one(defaults):
     try:
         raise KeyboardInterrupt
     except KeyboardInterrupt:
-        with pytest.raises(Terminated), hr.Player(paced=False):
+        with hr.Player(paced=False), pytest.raises(Terminated):
             signal.raise_signal(signal.SIGTERM)
