@@ -225,11 +225,11 @@ class BaseDriver(OpenedInWith):
 
 def carry_through(*steps: Callable[[], object]) -> None:
     """Call every step, whatever the others do; then raise the first failure, with the later ones noted on it."""
-    failures: list[Exception] = []
+    failures: list[BaseException] = []
     for step in steps:
         try:
             step()
-        except Exception as error:
+        except BaseException as error:
             failures.append(error)
     if failures:
         for other in failures[1:]:

@@ -166,8 +166,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with closed_pipes():
             status = _run(arguments)
         return status
-    except KeyboardInterrupt:
-        return fail("interrupted; what is written so far can be read", 130)
+    except KeyboardInterrupt as error:
+        notes = getattr(error, "__notes__", ["what is written so far can be read"])
+        return fail("; ".join(["interrupted", *notes]), 130)
     except (MemoryError, OSError, ValueError, HapticError) as error:
         if sys.flags.dev_mode:
             traceback.print_exception(error)
@@ -191,7 +192,7 @@ def _run(arguments: argparse.Namespace) -> int:
             sys.path.insert(0, "")
         return verb(arguments)  # type: ignore[no-any-return]
     except SystemExit as error:
-        from hapticrender.loop import Terminated
+        from hapticrender.process_signals import Terminated
 
         if isinstance(error, Terminated):
             raise

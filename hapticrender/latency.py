@@ -11,7 +11,6 @@ for in the loop's models a drive is held for a sample, and so acts half a sample
 """
 
 import statistics
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +19,7 @@ import numpy as np
 
 from hapticrender.devices import open_driver
 from hapticrender.errors import DriverError
+from hapticrender.loop import opened as open_at_rest
 from hapticrender.protocols import Array, Flag
 from hapticrender.touch.device_profile import DeviceProfile
 
@@ -94,14 +94,21 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
         raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
-    rng, trips, name = np.random.default_rng(0), list[Trip](), f"{driver}: latency"
-    for tries, opened in enumerate(_opened(driver), 1):
-        if trip := _trip(opened, amplitude, rng):
-            trips.append(trip)
-        if len(trips) == runs:
-            break
-        if tries == TRIES * runs:
-            raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
+    again = hasattr(driver, "loop_back")  # a new driver for every run
+    if not (again or driver.sensed_channels):
+        raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
+    rng, trips, tries = np.random.default_rng(0), list[Trip](), 0
+    while len(trips) < runs and tries < TRIES * runs:
+        with open_at_rest(made := driver.loop_back() if again else driver, made) as opened:
+            for _ in range(1 if again else TRIES * runs):
+                tries += 1
+                if trip := _trip(opened, amplitude, rng):
+                    trips.append(trip)
+                if len(trips) == runs:
+                    break
+    name = f"{driver}: latency"
+    if len(trips) < runs:
+        raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
     found = Latency(tuple(trips), float(opened.rate), int(opened.block), int(getattr(opened, "queued", 0)))
     weakest = min(trip.correlation for trip in trips)
     if weakest < LEAST_CORRELATION:
@@ -116,19 +123,6 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
             "programs that use the card, or use larger blocks"
         )
     return found
-
-
-def _opened(driver: Any) -> Iterator[Any]:
-    """Open drivers for one run after the other: new ones where it makes them, otherwise the same again and again."""
-    if hasattr(driver, "loop_back"):
-        while True:
-            with driver.loop_back() as opened:
-                yield opened
-    if not driver.sensed_channels:
-        raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
-    with driver:
-        while True:
-            yield driver
 
 
 def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | None:

@@ -5,11 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 import os
-import signal
-import threading
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,7 @@ from hapticrender.driver_checks import check_sensed, opened_once
 from hapticrender.errors import DeviceFault, PlateMismatch
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
+from hapticrender.process_signals import ended_with_program, stopped_by_signal
 from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Flag, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import refuse_to_overwrite
@@ -35,8 +34,6 @@ from hapticrender.touch.scene import Scene
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
-ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))  # Windows: one
-GUARDED: list[None] = []  # an entry for each run that one of these is to end by an exception
 
 Progress = Callable[[float, float], None]
 
@@ -133,8 +130,8 @@ def render(
 def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
     """Play a prepared rendering to its end; see `render`.
 
-    However it ends (an error, Ctrl-C, SIGTERM, SIGHUP), every sample played is recorded and the device is left at zero
-    drive.
+    However it ends (an error, a signal as docs/safety.md says), every sample played is recorded and the device is left
+    at zero drive.
     """
     driver, total = rendering.driver, rendering.samples
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
@@ -144,7 +141,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             recorder.append(**signals)
 
     device = rendering.device
-    with opened_once(device), recorder, stopped_by_signal(), driver, zero_drive_after(device):
+    with stopped_by_signal(), recorder, ended_with_program() as ending, opened(driver, device):
         if rendering.probe is not None:
             rendering.probe(device)
         loop, fault = _Loop(rendering), None
@@ -153,6 +150,8 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
                 keep(loop.advance(start, min(loop.step, total - start)))
                 if fault := loop.fault(start):
                     break
+                if ending.is_set():
+                    raise SystemExit("the program has ended")
                 if progress is not None:
                     progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
         finally:
@@ -247,54 +246,29 @@ def _warm_up(rendering: Rendering) -> None:
         controller.run(np.zeros((block, rendering.driver.sensed_channels)), nothing, nothing)
 
 
-class Terminated(SystemExit):
-    """SIGTERM or SIGHUP: ends the process by an exception, so that devices are left at rest."""
-
-
-def _end(number: int, frame: object) -> None:
-    raise Terminated(128 + number)
-
-
 @contextmanager
-def stopped_by_signal() -> Iterator[None]:
-    """Turn `ENDING` into `Terminated` in the main thread: devices are left at rest; may be nested or overlap.
+def opened(driver: Any, device: Driver, hangs: Callable[[], bool] = lambda: False) -> Iterator[Any]:
+    """Open the driver of a device, once; however it ends, play zeros and close it, while signals wait.
 
-    A signal that somebody else handles, or that `nohup` ignores, is left alone.
+    Zeros are not played where the device does so itself; where it `hangs`, they are not, and nothing is closed.
     """
-    main = threading.current_thread() is threading.main_thread()
-    ours = [each for each in ENDING if main and signal.getsignal(each) in (signal.SIG_DFL, _end)]
-    if not ours:
-        yield
-        return
-    for each in ours:
-        signal.signal(each, _end)
-    GUARDED.append(None)
+    with opened_once(device), stopped_by_signal(), ExitStack() as waiting, ExitStack() as stack:
+        entered = driver.__enter__()
+        stack.push(lambda *error: None if hangs() else driver.__exit__(*error))
+        stack.push(lambda kind, error, _: _rest(device, error, hangs))
+        stack.callback(lambda: waiting.enter_context(stopped_by_signal(wait=True)))
+        yield entered
+
+
+def _rest(device: Driver, error: BaseException | None, hangs: Callable[[], bool]) -> None:
+    """Play zeros until they have come through; a failure is noted on the error that there is already."""
     try:
-        yield
-    finally:
-        GUARDED.pop()
-        for each in ENDING if not GUARDED else ():
-            if signal.getsignal(each) is _end:
-                signal.signal(each, signal.SIG_DFL)
-
-
-@contextmanager
-def zero_drive_after(device: Driver, hangs: Callable[[], bool] = lambda: False) -> Iterator[None]:
-    """Play zeros until they have come through, whatever happened; not where the device does so itself, or hangs."""
-
-    def rest() -> None:
         if not (getattr(device, "zero_on_exit", False) or hangs()):
             play_zeros(device)
-
-    try:
-        yield
-    except BaseException as error:
-        try:
-            rest()
-        except Exception as second:
-            error.add_note(f"and while the drive was set to zero: {second}")
-        raise
-    rest()
+    except Exception as second:
+        if error is None:
+            raise
+        error.add_note(f"and while the drive was set to zero: {second}")
 
 
 def _device_loop(driver: Driver, controller: Controller) -> DeviceLoop | None:

@@ -32,14 +32,14 @@ import numpy as np
 from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
-from hapticrender.driver_checks import opened_once
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import play_zeros, prepare, recorder_of, stopped_by_signal, warn_of, zero_drive_after
+from hapticrender.loop import opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_state import BandState, PlayerState
+from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
@@ -60,7 +60,8 @@ TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up; with
 class Player(Addressed):
     """Plays textures on a device while the application goes on; used in a `with` statement.
 
-    Its methods may be called from any thread; `finger` never waits for the others.
+    Its methods may be called from any thread; `finger` never waits for the others.  Signals that end the process leave
+    zero drive where the `with` is entered in the main thread; elsewhere the application handles them (docs/live.md).
 
     Parameters
     ----------
@@ -80,9 +81,8 @@ class Player(Addressed):
         permanently, within 10 ms; 0.1 to 60, and at least two blocks of the driver; inf: never.  `sleep` counts as
         calls.  Unless it is given: 5 s (and two blocks) while a finger that `finger` has set touches the surface.
     **tables
-        Further fields of the scene, in place of a scene's own: profile, simulation, rendering, method, seed.  No
-        touch_panel: that of a scene locates the finger that moves by itself, and positions passed to `finger` are taken
-        as they are.
+        Further fields of the scene, in place of its own: profile, simulation, rendering, method, seed.  No touch_panel:
+        that of a scene locates the finger that moves by itself; positions passed to `finger` are taken as they are.
 
     Raises
     ------
@@ -133,6 +133,7 @@ class Player(Addressed):
 
     def __enter__(self) -> Self:
         self._entered = True
+        self._stack.enter_context(stopped_by_signal())
         atexit.register(self.__exit__, None, None, None)  # where the program ends before its `with` does
         return self
 
@@ -140,10 +141,11 @@ class Player(Addressed):
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         """Zero drive, then close the device and the recording; a fault not seen yet is raised, later ones noted."""
-        atexit.unregister(self.__exit__)
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        with noted_on(error or (None if self._raised else self._error)), ExitStack() as last:  # last to first
+        first = error or (None if self._raised else self._error)
+        with stopped_by_signal(wait=True), noted_on(first), ExitStack() as last:  # last to first, whatever fails
+            last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             with self._lock:  # a device that is being opened is closed, too; no other is opened
                 self._entered = False
@@ -156,6 +158,10 @@ class Player(Addressed):
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
             raise HapticError(slow)
+        if self._unwritten is not None:
+            if error is None:
+                raise self._unwritten
+            error.add_note(f"and the recording is not whole: {self._unwritten}")
         warn_of(compared())
 
     @property
@@ -250,7 +256,7 @@ class Player(Addressed):
             bands = replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=())
             recorder = recorder_of(rendering, path, scene=scene, bands=bands)
             recorder.begin()
-            self._recorder, self._unwritten = recorder, None
+            self._recorder = recorder
 
     def end_recording(self) -> Recording:
         """End the recording and return it."""
@@ -260,9 +266,9 @@ class Player(Addressed):
             if self._recorder is None:
                 raise ValueError("nothing is being recorded: call record first")
             self._service()
-            recorder, self._recorder = self._recorder, None
-            if self._unwritten is not None:
-                raise self._unwritten
+            recorder, unwritten, self._recorder, self._unwritten = self._recorder, self._unwritten, None, None
+            if unwritten is not None:
+                raise unwritten
             recording = recorder.finish()
             recording.warnings = getattr(self._loop, "compare", lambda: tuple)()()
             return recording
@@ -369,11 +375,7 @@ class Player(Addressed):
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
         if self._given is None and rendering.plant is not None:
             self._motion.attach(rendering)
-        stack.enter_context(opened_once(device))
-        stack.enter_context(stopped_by_signal())
-        rendering.driver.__enter__()
-        stack.push(lambda *error: None if self._threads.hanging.is_set() else rendering.driver.__exit__(*error))
-        stack.enter_context(zero_drive_after(device, self._threads.hanging.is_set))
+        stack.enter_context(opened(rendering.driver, device, self._threads.hanging.is_set))
         if rendering.probe is not None:
             rendering.probe(device)
         self._loop = loop
@@ -475,8 +477,7 @@ class Player(Addressed):
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""
-        loop = self._loop
-        if loop is None:
+        if (loop := self._loop) is None:
             return
         running = self._paced and self._error is None
         with self._lock:
@@ -496,5 +497,7 @@ class Player(Addressed):
 
     def _close_recorder(self, stopped: bool) -> None:
         if self._recorder is not None:
-            with suppress(OSError):
+            try:
                 self._recorder.close(stopped)
+            except OSError as error:
+                self._unwritten = self._unwritten or error

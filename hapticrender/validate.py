@@ -28,7 +28,8 @@ from hapticrender.control.methods import method_named
 from hapticrender.devices import SIMULATED, naming_driver
 from hapticrender.errors import HapticError, SceneError
 from hapticrender.formatting import as_json, printable
-from hapticrender.loop import Terminated, prepare
+from hapticrender.loop import prepare
+from hapticrender.process_signals import Terminated
 from hapticrender.protocols import Rendering
 from hapticrender.report import outputs
 from hapticrender.report.text import progress as progress_of

@@ -109,7 +109,7 @@ def play(arguments: argparse.Namespace) -> int:
     try:
         with naming(arguments.scene):
             player = Player(scene, _driver(arguments.driver, scene, arguments.force))
-        with naming_driver(arguments.driver), player:
+        with outputs.naming_full(out or ""), naming_driver(arguments.driver), player:
             with naming(arguments.scene), naming_driver(arguments.driver, ValueError, TypeError):
                 player.play(scene.texture)
             if out:
@@ -218,6 +218,7 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.plants.identify_friction import identify_resonance, identify_screen
     from hapticrender.plants.plate import Plate
     from hapticrender.plants.ultrasonic import UltrasonicPlate
+    from hapticrender.process_signals import stopped_by_signal
     from hapticrender.touch.finger import Finger
 
     scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
@@ -225,7 +226,8 @@ def identify(arguments: argparse.Namespace) -> int:
         outputs.check_file("--out", arguments.out)
         scene = _kept(arguments.out, scene)
     found: Any
-    with naming(arguments.scene or "identify"), naming_driver(arguments.driver, ValueError, TypeError):
+    named = naming(arguments.scene or "identify"), naming_driver(arguments.driver, ValueError, TypeError)
+    with stopped_by_signal(), named[0], named[1]:
         known = scene.device in ("vt-plate", "ultrasonic", "electroadhesion")
         require(known, "device.kind", scene.device, "vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)

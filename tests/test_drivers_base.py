@@ -60,6 +60,20 @@ def test_close_carries_on_past_a_failure_and_raises_the_first():
     assert caught.value.__notes__ == ["and then: Diary: close: gone"]
 
 
+def test_close_releases_the_device_after_a_signal_in_its_zeros():
+    """Of a driver that nothing guards against signals."""
+
+    class Interrupted(Diary):
+        def _play(self, drive):
+            self._note("rest")
+            raise KeyboardInterrupt
+
+    driver = Interrupted().open()
+    with pytest.raises(KeyboardInterrupt):
+        driver.close()
+    assert driver.entries == ["open", "rest", "close"]
+
+
 def test_a_failure_to_close_does_not_hide_the_error_of_the_body():
     with pytest.raises(ZeroDivisionError) as caught, Diary(fails_at=("rest",)):
         raise ZeroDivisionError

@@ -20,7 +20,7 @@ from synthetic import make_bands
 from waves import Own
 
 import hapticrender as hr
-from hapticrender.loop import ENDING, _end, stopped_by_signal
+from hapticrender.process_signals import DEFAULT, _end, stopped_by_signal
 
 RATE = 5000.0
 TESTS = Path(__file__).resolve().parent
@@ -121,7 +121,8 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, name, status):
 def test_a_signal_that_is_ignored_or_handled_stays_so():
     """`nohup` ignores SIGHUP before the program starts; an application may handle it."""
     for own in (signal.SIG_IGN, lambda *given: None):
-        before = {each: signal.signal(each, given) for each, given in zip(ENDING, (signal.SIG_DFL, own), strict=True)}
+        given = (signal.default_int_handler, signal.SIG_DFL, own)
+        before = {each: signal.signal(each, handler) for each, handler in zip(DEFAULT, given, strict=True)}
         try:
             with stopped_by_signal(), stopped_by_signal():
                 assert signal.getsignal(signal.SIGTERM) is _end
@@ -135,7 +136,7 @@ def test_a_signal_that_is_ignored_or_handled_stays_so():
 
 def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
     """Ctrl-C while the reference of a tone is computed for the journal; signals are left as they were before."""
-    before = [signal.getsignal(each) for each in ENDING]
+    before = [signal.getsignal(each) for each in DEFAULT]
     came = []
 
     def waveform(at, position):
@@ -147,7 +148,7 @@ def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
     plate, texture = Logged(block=25, told=25, delay=25), Own(waveform, bands=make_bands(72.0, 20e-6))
     with pytest.raises(KeyboardInterrupt):
         hr.render(hr.Scene(texture=texture, duration=2.0), driver=plate, journal=tmp_path / "run.au")
-    assert [signal.getsignal(each) for each in ENDING] == before
+    assert [signal.getsignal(each) for each in DEFAULT] == before
     assert _end not in before
     played = np.concatenate(plate.played)
     recording = hr.Recording.load(tmp_path / "run.au")

@@ -85,7 +85,7 @@ def test_type_checkers_see_every_public_name():
 
 GROUND = {
     f"hapticrender.{name}"
-    for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "vectors", "mathx")
+    for name in ("protocols", "errors", "bands", "checks", "formatting", "jit", "vectors", "mathx", "process_signals")
 }
 GROUND |= {f"hapticrender.{name}" for name in ("defaults", "devices", "driver_checks", "second_core")}
 DEVICES = {"touch", "control", "plants"}

@@ -6,7 +6,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from functools import partial
 
 import numpy as np
@@ -18,6 +18,7 @@ import hapticrender as hr
 import hapticrender.player
 from benchmarks import faults
 from hapticrender.bands import Bands
+from hapticrender.cli import main
 from hapticrender.driver_checks import OPEN
 from hapticrender.loop import Terminated
 from hapticrender.recordings.recording import Recording
@@ -337,6 +338,62 @@ def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeyp
         assert player.state().bands[0].error < 0.02
         with pytest.raises(OSError, match="No space left"):
             player.end_recording()
+
+
+@contextmanager
+def full_disk(size):
+    """Files of this process may not grow beyond `size` bytes: writing is then an `OSError`, as on a full disk."""
+    resource = pytest.importorskip("resource")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def record_onto_a_full_disk(player, path):
+    player.play(TONE)
+    player.record(path)
+    with full_disk(200_000):
+        player.sleep(2.0)
+    assert player.state().bands[0].error < 0.02
+
+
+def fail_on_a_full_disk(player, path):
+    record_onto_a_full_disk(player, path)
+    fail(player)
+
+
+def test_a_recording_that_a_full_disk_cuts_off_is_an_error_once(tmp_path):
+    """By `end_recording`, or where the `with` ends; a note where that ends by another error.  What is there is read."""
+    full = pytest.raises(OSError, match="File too large")
+    with full, hr.Player(paced=False) as player:
+        record_onto_a_full_disk(player, tmp_path / "with.au")
+    with hr.Player(paced=False) as player:
+        record_onto_a_full_disk(player, tmp_path / "ended.au")
+        with full:
+            player.end_recording()
+        player.record(tmp_path / "next.au")
+        player.sleep(0.5)
+    with pytest.raises(ZeroDivisionError) as caught, hr.Player(paced=False) as player:
+        fail_on_a_full_disk(player, tmp_path / "noted.au")
+    assert ["File too large" in note for note in caught.value.__notes__] == [True]
+    for name, least, most in (("with", 0.1, 1.9), ("ended", 0.1, 1.9), ("noted", 0.1, 1.9), ("next", 0.5, 0.6)):
+        recording = Recording.load(tmp_path / f"{name}.au")
+        assert least <= len(recording) / recording.rate < most
+
+
+def test_play_ends_in_an_error_where_the_disk_is_full(tmp_path, capsys):
+    """Status 2, with the folder and why; the page about what is there is written."""
+    (tmp_path / "live.toml").write_text(hr.Scene(texture=TONE, duration=4.0, name="live").to_toml())
+    with full_disk(800_000):  # room for the picture, and for half of the recording
+        assert main(["play", str(tmp_path / "live.toml"), "--out", str(tmp_path / "out")]) == 2
+    printed = capsys.readouterr()
+    assert f"hapticrender: {tmp_path / 'out'}: File too large" in printed.err
+    assert "page: " in printed.out
+    recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
+    assert 0.1 < len(recording) / recording.rate < 3.9
 
 
 def test_samples_that_were_not_kept_are_marked(tmp_path):

@@ -43,6 +43,7 @@ from hapticrender.plants.fitting import (
 )
 from hapticrender.plants.multisine import Multisine, design_multisine
 from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.touch.finger import Finger
 
@@ -263,7 +264,7 @@ def identify(
         options = {"wait": wait, "amplitude": amplitude, "contact": contact, "unexplained": unexplained}
         made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
         made = made.driven_by_host() if hasattr(made, "driven_by_host") else made
-        with naming_driver(driver), made as opened:
+        with stopped_by_signal(), naming_driver(driver), made as opened:
             found = identify(opened, parameters, seconds=seconds, **options)
         return found.shortened(getattr(made, "host_delay", 0))
     rate = float(driver.rate)
@@ -325,12 +326,13 @@ def _whole_drive(sine: Multisine, start: int, fade: int) -> Array:
     return sine.drive[turn % samples] * envelope[:, None]
 
 
+@stopped_by_signal()
 def play(driver: Driver, drive: Array) -> Sensed:
     """Play `drive` (n, channels) in blocks, then at least a block of zeros; return what was sensed of it.
 
     It is played again, up to `TRIES` times, where samples are lost.  A `DesignError` where they were lost every time,
-    or the device reports a saturated drive or a clipped sensor, a `DriverError` where it failed; after either, zero
-    drive was sent if it still took any.
+    or the device reports a saturated drive or a clipped sensor, a `DriverError` where it failed; after either, or a
+    signal, zero drive was sent if it still took any.
     """
     for _ in range(TRIES - 1):
         with suppress(SamplesLost):
