@@ -103,7 +103,7 @@ class AudioDriver(BaseDriver):
         self._unknown = [name for name, value in needed.items() if value is None and self.inputs]
         self._stream: Stream | None = None
         self._entry: Any = None
-        self._number = 0  # of the next block of `play`
+        self._number, self._late = 0, 0  # of the next block of `play`; `play`s in a row whose drive came too late
         self._lost = self._before = 0  # blocks that lost samples; the relay's overruns at `start`
         super().__init__(
             rate=rate,
@@ -203,8 +203,10 @@ class AudioDriver(BaseDriver):
             raise DriverError(f"{self}: play: it runs a controller; stop it first")
         number, queue = self._number, self._queue
         queue.put(number + self._ahead, drive * self.drive_scale)
-        if queue.blocks - number > MOST_LATE:
-            number = queue.blocks  # what is older is lost; go on with the next one
+        behind = queue.blocks - number
+        self._late = self._late + 1 if behind > self._ahead else 0
+        if behind > MOST_LATE or self._late > 2 * MOST_LATE:  # a host that does not catch up
+            number, self._late = queue.blocks, 0  # what is older is lost; go on with the next one
         if self._relay.count("function") == 0:
             self._relay.call(queue.address, queue.user_data)
         self._wait_for(number)

@@ -74,7 +74,7 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
         factory = imported(text, name, called)
     try:
         with naming_driver(text, ValueError, TypeError):
-            argument, options = _split(argument)
+            argument, options = _split(argument, factory)
             taken = inspect.signature(factory).parameters if profile or overwrite else {}
             offered = {
                 **(vars(profile.calibration) if profile else {}),
@@ -149,13 +149,16 @@ def imported(text: str, module: str, called: str) -> Any:
     return factory
 
 
-def _split(argument: str) -> tuple[str, dict[str, Any]]:
-    """Split "0?block=256&channels=3,4" into argument and options; a "?" without them belongs to the argument."""
+def _split(argument: str, factory: Callable[..., Any]) -> tuple[str, dict[str, Any]]:
+    """Split "0?block=256&channels=3,4" into argument and options of the factory; any other "?" is of the argument."""
     before, mark, after = argument.rpartition("?")
     pairs = [each.partition("=") for each in after.split("&")]
-    if not mark or not all(name.isidentifier() and equals for name, equals, _ in pairs):
+    if not mark or not all(equals for _, equals, _ in pairs):
         return argument, {}
     options: dict[str, Any] = {name: value for name, _, value in pairs}
+    taken = inspect.signature(factory).parameters
+    if not (options.keys() <= taken.keys() or any(each.kind is each.VAR_KEYWORD for each in taken.values())):
+        return argument, {}
     for name, value in options.items():
         with suppress(ValueError, SyntaxError):  # a word
             options[name] = ast.literal_eval(value)

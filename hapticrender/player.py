@@ -3,11 +3,10 @@
     with hr.Player("vt-plate") as player:
         player.play(hr.Grating(wavelength=1e-3, amplitude=10e-6))
         player.finger(position=0.01, velocity=0.08, load=0.4)
-        print(player.state())
 
-Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back (it
-has `start` and `stop`) is handed the loop as its callback; one whose controller runs on the device (it has `loop`)
-brings a loop of its own; any other is played by a thread.
+Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back
+(`start`, `stop`) is handed it as its callback; one whose controller runs on the device (`loop`) brings its own; any
+other is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
 Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.
@@ -54,7 +53,7 @@ SERVICE = 0.05  # s between two looks: what comes next is computed, what was is 
 UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
-TIMEOUT = 5.0  # s without a sample, after which `sleep` gives a device up; without a call, an application
+TIMEOUT = 5.0  # s without a sample, after which a paced device is given up; without a call, an application
 
 
 class Player(Addressed):
@@ -126,7 +125,8 @@ class Player(Addressed):
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls, self._watched = 0, math.inf  # of the application under way; s: the watchdog's time at the moment
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
-        self._recorded, self._served = 0, 0.0  # samples of this loop that were looked at; when the last look was
+        self._recorded, self._seen = 0, 0  # samples of this loop that were looked at; and played at the last look
+        self._served, self._idle = 0.0, 0.0  # s: when that was; of looks since there was a new sample
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
         self._stopping, self._timeout = self._threads.stopping, TIMEOUT  # s; and two blocks of the driver
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
@@ -143,7 +143,7 @@ class Player(Addressed):
         """Zero drive, then close the device and the recording; a fault not seen yet is raised, later ones noted."""
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        first = error or (None if self._raised else self._error)
+        first, compared = error or (None if self._raised else self._error), tuple
         with stopped_by_signal(wait=True), noted_on(first), ExitStack() as last:  # last to first, whatever fails
             last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
@@ -152,8 +152,8 @@ class Player(Addressed):
                 last.push(self._stack.pop_all())
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
-            failed = self._error is not None or isinstance(error, Exception)  # which Ctrl-C is not
-            compared = getattr(None if failed else self._loop, "compare", lambda: tuple)()  # while it plays
+            if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; while it plays
+                compared = getattr(self._loop, "compare", lambda: tuple)()
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
@@ -285,25 +285,18 @@ class Player(Addressed):
     def sleep(self, seconds: float) -> None:
         """Wait until the device has played for so long; one that is not paced plays meanwhile.
 
-        Raises
-        ------
-        DeviceFault, DriverError
-            The device has failed.
+        A `DeviceFault` or `DriverError` where the device has failed.
         """
         seconds = number("seconds", seconds, "s", least=0.0)
         with self._lock:
             self._check()
             rate = self._playing("sleep").driver.rate
-        end, seen, since = self.time + seconds, self.time, time.monotonic()
+        end = self.time + seconds
         while self.time < end - 0.5 / rate:
             if self._paced:
                 self._stopping.wait(min(end - self.time, SERVICE))
             else:
                 self._advance(min(end - self.time, SERVICE))
-            if self.time > seen:
-                seen, since = self.time, time.monotonic()
-            if time.monotonic() - since > self._timeout:
-                raise DeviceTimeout(f"the device has played no sample for {self._timeout:.3g} s: check it and driver")
             with self._lock:
                 self._check()
 
@@ -430,7 +423,8 @@ class Player(Addressed):
     def _serve(self) -> None:
         while not self._stopping.wait(POINTING):
             loop = self._playing("play")
-            due = time.monotonic() - self._served >= (SERVICE if isinstance(loop, LiveLoop) else POINTING)
+            period = SERVICE if isinstance(loop, LiveLoop) else POINTING
+            due = time.monotonic() - self._served >= period
             if due and isinstance(loop, LiveLoop):
                 loop.fill_some()  # which may take long: others go on meanwhile
             with self._lock:
@@ -442,6 +436,9 @@ class Player(Addressed):
                 if due:
                     self._served = time.monotonic()
                     self._service()
+                    self._seen, self._idle = loop.samples, self._idle + period if loop.samples == self._seen else 0.0
+                if self._idle > self._timeout:  # by looks: time during which this process stood still does not count
+                    raise DeviceTimeout(f"the device has played no sample for {self._idle:.2g} s: check it and driver")
 
     def _point(self) -> None:
         """Send the position of the scene's finger to a device that does not sense it."""

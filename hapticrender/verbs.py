@@ -56,7 +56,7 @@ def _check_run_folders(folders: list[Path], arguments: argparse.Namespace, sourc
 
 def demo(arguments: argparse.Namespace) -> int:
     """Render the built-in scenes and make a page about them."""
-    scenes = builtin_scenes()
+    scenes = builtin_scenes(carriers=None if arguments.method in (None, "inverse") else 6)
     _check_run_folders([arguments.out / name for name in scenes], arguments)
     renderings = _prepare(scenes, arguments)
     finished: list[outputs.Outputs] = []

@@ -67,7 +67,7 @@ def tiny(tmp_path):
 def two_tiny_scenes(monkeypatch):
     """A demo of two short scenes."""
     scenes = {name: Scene.from_toml_text(TINY.replace("tiny", name), where=name) for name in ("one", "two")}
-    monkeypatch.setattr("hapticrender.verbs.builtin_scenes", lambda: scenes)
+    monkeypatch.setattr("hapticrender.verbs.builtin_scenes", lambda **_: scenes)
     return scenes
 
 
@@ -96,7 +96,7 @@ def complaint(result):
 def test_the_demo_leaves_one_page_and_all_its_parts(run, tmp_path, monkeypatch):
     names = ["grating-47", "one-texture-vt-plate", "one-texture-electroadhesion"]
     scenes = {name: replace(builtin_scenes()[name], duration=1.0) for name in names}
-    monkeypatch.setattr("hapticrender.verbs.builtin_scenes", lambda: scenes)
+    monkeypatch.setattr("hapticrender.verbs.builtin_scenes", lambda **_: scenes)
     status, out, errors = run("demo", "--out", tmp_path / "out")
     assert status == 0
     lines = [line for line in errors if not line.startswith("compiling")]  # once, where the kernels' cache is empty

@@ -220,16 +220,23 @@ class Held(StrangersPlate):
 
     def play(self, drive):
         sensed = super().play(drive)
-        if self.count % self.hold == 0 and self.count <= self.dead_from:
-            self.held = sensed.sensed.copy()
-        self.count += 1
-        return sensed._replace(sensed=self.held)
+        shown = sensed.sensed.copy()
+        for row in shown:
+            if self.count % self.hold == 0 and self.count <= self.dead_from:
+                self.held = row.copy()
+            self.count += 1
+            row[:] = self.held
+        return sensed._replace(sensed=shown)
 
 
-@pytest.mark.parametrize(("rate", "hold", "noise"), [(20e3, 1, 0.0), (5e3, 5, 1e-6), (5e3, 10, 1e-6)])
-def test_converters_that_repeat_their_values_are_not_frozen(rate, hold, noise):
-    """Values of 0.12 um without noise at 20 kHz, and values held over 1 and 2 ms at 5 kHz, under a finger."""
-    plate = Held(rate=rate, noise=noise, finger=(5e-3, 2.0, 2000.0), position=0.01, load=0.5, contact=1.0)
+@pytest.mark.parametrize(
+    ("rate", "hold", "noise", "block"),
+    [(20e3, 1, 0.0, 1), (5e3, 5, 1e-6, 1), (5e3, 10, 1e-6, 1), (5e3, 10, 1e-6, 25), (48e3, 96, 1e-6, 64)],
+)
+def test_converters_that_repeat_their_values_are_not_frozen(rate, hold, noise, block):
+    """Values of 0.12 um without noise at 20 kHz, and values held over 1 and 2 ms, under a finger."""
+    touching = {"finger": (5e-3, 2.0, 2000.0), "position": 0.01, "load": 0.5, "contact": 1.0}
+    plate = Held(rate=rate, noise=noise, block=block, told=block, **touching)
     plate.hold = hold
     hr.render(scene(20.0, 10e-6, 0.4), driver=plate)
 

@@ -459,6 +459,7 @@ def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_ten
     assert (summary["bands"][0]["error_end_1"] is None) == (share < 0.05)
 
 
+@pytest.mark.parametrize("settle", [0.1, 0.5])  # a piece begins with the first sample, or later
 @pytest.mark.parametrize(
     ("wrong", "verdict"),
     [
@@ -467,7 +468,7 @@ def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_ten
         (lambda since: np.where(since > 1.0, 0.5, 0.0), "failed"),  # a step of the friction within the touch
     ],
 )
-def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong, verdict):
+def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong, verdict, settle):
     """It builds up within 3 ms of a touch, and falls a sample after a lift; 20 mN of texture beside 0.5 N of it."""
     time = times(4.0)
     touching, since = (time >= 1.0) & (time < 3.5), time - 1.0
@@ -476,7 +477,7 @@ def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong
     motion, bands = texture + np.roll(base, 1), make_bands(100.0, 0.0)
     position = np.where(touching, 0.0, np.nan)
     signals = make_signals(bands, 0.0, extra=motion[:, None], position=position) | {"reference": texture}
-    summary = summary_of(bands, signals, {"unit": "N"}, settle=0.5)
+    summary = summary_of(bands, signals, {"unit": "N"}, settle=settle)
     assert summary["verdict"] == verdict, summary["reason"]
 
 

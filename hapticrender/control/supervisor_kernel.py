@@ -112,14 +112,14 @@ SUPERVISOR_T = numba.from_dtype(SUPERVISOR)
 def repeats_frame(supervisor, i, value, drive):
     """Whether sensor `i` shows the device's last block (`frame` samples) again, while the sum of the drive differs.
 
-    A texture of that period repeats itself too, and is none.
+    A texture of that period repeats itself too, and is none; one value that repeats is for test 2 to find.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
     p, count, least, most = s.p, s.frame_repeats, s.least_change, s.most_change
     frame = carray(pointer(p.frame_at, F8), (p.frame, MOST_SENSORS, 2))
     row = s.sample % p.frame
     change = drive - frame[row, i, 1]
-    if value == frame[row, i, 0] and change == change:
+    if value == frame[row, i, 0] and change == change and s.repeats[i] < p.frame:
         count[i] += 1
         least[i], most[i] = min(least[i], change), max(most[i], change)
     else:

@@ -351,11 +351,11 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
             given = Sensed(played.sensed, played.position, normal_load=played.normal_load, flags=played.flags)
             sensed = check_sensed(driver, given, 0)
             raised = Flag(0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
+            if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
+                raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
             if raised & Flag.OVERRUN:
                 cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and sound server)"
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
-            if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
-                raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
         try:

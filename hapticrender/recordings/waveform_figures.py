@@ -127,8 +127,9 @@ def _signals(recording: Recording, start: int, stop: int) -> Array:
     reference, motion = (np.where(np.abs(each) < RUNAWAY, each, np.nan) for each in values)
     landed = np.zeros(len(motion), bool)
     if recording.header.unit == "N":
-        landing = min(round(LANDING * recording.rate), start)
-        touching = np.isfinite(recording.read("position", start - landing, stop))
+        landing, before = round(LANDING * recording.rate), max(start - round(LANDING * recording.rate), 0)
+        touching = np.isfinite(recording.read("position", before, stop))
+        touching = np.pad(touching, (landing - start + before, 0), mode="edge")  # a run begins as it is
         felt = np.asarray(sliding_window_view(touching, landing + 1).all(axis=1))
         motion, landed = _without_base(motion, touching[landing:], felt), touching[landing:] & ~felt
     error = (motion - np.outer(reference, shares)) / scales

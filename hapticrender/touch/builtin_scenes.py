@@ -16,9 +16,10 @@ LIFTING = Finger.sliding(  # slides, reverses, lifts and touches again
 )
 
 
-def builtin_scenes() -> dict[str, Scene]:
-    """Every built-in scene under its name."""
-    return {scene.name: scene for scene in (*_on_the_plate(), *one_texture().values(), *_by_friction())}
+def builtin_scenes(*, carriers: int | None = None) -> dict[str, Scene]:
+    """Every built-in scene under its name; recordings with `carriers`, which methods that work by bands need."""
+    every = *_on_the_plate(carriers), *one_texture().values(), *_by_friction(carriers)
+    return {scene.name: scene for scene in every}
 
 
 def one_texture() -> dict[str, Scene]:
@@ -36,14 +37,14 @@ def _scene(name: str, texture: Any, finger: Finger, duration: float, **fields: A
     return Scene(name=name, texture=texture, finger=finger, duration=duration, **fields)
 
 
-def _on_the_plate() -> Iterator[Scene]:
+def _on_the_plate(carriers: int | None) -> Iterator[Scene]:
     """The paper's gratings on the free plate, ridges of 1 mm, a recording, a slide, a press, and fast swipes."""
     for frequency in PAPER_FREQUENCIES:
         texture = Grating(amplitude=10e-6, frequency=frequency)
         yield _scene(f"grating-{frequency:g}", texture, Finger.absent(), 5.0, tolerance=0.02)
     ridges = Grating(amplitude=10e-6, wavelength=1e-3)  # 80 Hz at 80 mm/s
     yield _scene("spatial-grating", ridges, LIFTING, 6.0)
-    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08), SWEEPING, 5.0)
+    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08, carriers=carriers), SWEEPING, 5.0)
     wandering = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
     yield _scene("sliding", Grating(amplitude=50e-6, frequency=143.0), wandering, 5.0)  # near the rocking mode
     press = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")  # its sag is many times the target
@@ -52,11 +53,11 @@ def _on_the_plate() -> Iterator[Scene]:
     yield _scene("swiping", ridges, swipes, 5.0)
 
 
-def _by_friction() -> Iterator[Scene]:
+def _by_friction(carriers: int | None) -> Iterator[Scene]:
     """Ridges and a recording on a screen, swipes on an ultrasonic plate, and one that warms up."""
     ridges = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
     yield _scene("screen-spatial", ridges, LIFTING, 6.0, device="electroadhesion")
-    recorded = Synthetic(amplitude=40e-6, speed=0.08)
+    recorded = Synthetic(amplitude=40e-6, speed=0.08, carriers=carriers)
     yield _scene("screen-recorded", recorded, SWEEPING, 5.0, device="electroadhesion")
     swipes = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
     slower = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)

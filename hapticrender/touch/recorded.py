@@ -296,6 +296,11 @@ class Synthetic(Validated, Composable):
     seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
     carriers: int | None = parameter(None, about="of its strongest components; None: played whole", least=1, most=8)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        bound = f"at most components = {self.components}"
+        require((self.carriers or 1) <= self.components, "carriers", self.carriers, bound)
+
     @property
     def spatial(self) -> bool:
         """Whether it is read at the finger's position."""
