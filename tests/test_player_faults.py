@@ -20,7 +20,7 @@ from benchmarks import faults
 from hapticrender.bands import Bands
 from hapticrender.cli import main
 from hapticrender.driver_checks import OPEN
-from hapticrender.loop import Terminated
+from hapticrender.process_signals import Terminated
 from hapticrender.recordings.recording import Recording
 
 
