@@ -17,7 +17,7 @@ from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
 
-Arrays = dict[str, tuple[int, Callable[[], Any]]]  # of a file, by name: bytes, and what reads it
+Arrays = dict[str, tuple[float, Callable[[], Any]]]  # of a file, by name: bytes (NaN: not here), and what reads it
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 
 
@@ -127,7 +127,7 @@ def npz_arrays(path: Path) -> Iterator[Arrays]:
     """Provide the arrays of an NPZ file."""
     with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what is no archive
         size = {each.filename: each.file_size for each in file.zip.infolist()}
-        yield {name: (size[f"{name}.npy"], partial(file.__getitem__, name)) for name in file.files}
+        yield {name: (size.get(f"{name}.npy", math.nan), partial(file.__getitem__, name)) for name in file.files}
 
 
 def _h5py() -> Any:
@@ -149,12 +149,13 @@ def _write_h5(path: Path, header: Header, frames: Any) -> None:
 
 @contextmanager
 def h5_arrays(path: Path) -> Iterator[Arrays]:
-    """Provide the arrays of an HDF5 file, but none that lies in another file."""
+    """Provide the arrays of an HDF5 file; one that lies in another file has no size."""
     h5py, found = _h5py(), Arrays()
 
     def take(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and not (entry.external or entry.is_virtual):
-            found[name] = math.prod(entry.shape) * entry.dtype.itemsize, partial(entry.__getitem__, ())
+        if isinstance(entry, h5py.Dataset):
+            size = math.nan if entry.external or entry.is_virtual else math.prod(entry.shape) * entry.dtype.itemsize
+            found[name] = size, partial(entry.__getitem__, ())
 
     with h5py.File(path, "r") as file:
         file.visititems(take)  # which follows no link
@@ -186,9 +187,10 @@ def _reader(arrays: Callable[[Path], Any]) -> Callable[[Path], tuple[Header, Arr
         with arrays(path) as found:
 
             def load(name: str) -> Any:
-                if name not in found:
+                size, values = found.get(name, (math.nan, tuple))
+                most = path.stat().st_size
+                if math.isnan(size):
                     raise ValueError(f"{name}: is missing, or no data set of this file")
-                (size, values), most = found[name], path.stat().st_size
                 if size > most:
                     raise ValueError(f"{name} has {size} bytes, the file {most}: compressed recordings are not read")
                 return values()
