@@ -1,11 +1,12 @@
-"""Verdicts on what sensors show: the uncertainty of their gain, and their noise."""
+"""Verdicts on what sensors show (the uncertainty of their gain, noise), on touches of a screen, on a stored play."""
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic import make_bands, make_signals, summary_of
+from synthetic import make_bands, make_play, make_signals, summary_of, times
 
 import hapticrender as hr
 from hapticrender.loop import recorder_of
@@ -80,3 +81,41 @@ def test_noise_excuses_no_uncertainty_that_is_over_the_bound_alone(rng, calibrat
     assert summary["verdict"] == found
     assert ("not distinct from the noise" in summary["reason"]) == (found == "not judged")
     assert summary["worst"]["value"] == pytest.approx(value, abs=0.01)
+
+
+@pytest.mark.parametrize("settle", [0.1, 0.5])  # a piece begins with the first sample, or later
+@pytest.mark.parametrize(
+    ("wrong", "verdict"),
+    [
+        (lambda since: 0.0, "passed"),
+        (lambda since: np.where((since > 4e-3) & (since < 6e-3), 0.1, 0.0), "failed"),  # a click of 0.1 N, once landed
+        (lambda since: np.where(since > 1.0, 0.5, 0.0), "failed"),  # a step of the friction within the touch
+    ],
+)
+def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong, verdict, settle):
+    """It builds up within 3 ms of a touch, and falls a sample after a lift; 20 mN of texture beside 0.5 N of it."""
+    time = times(4.0)
+    touching, since = (time >= 1.0) & (time < 3.5), time - 1.0
+    texture = 20e-3 * np.sin(400 * np.pi * time) * touching
+    base = np.where(touching, 0.5 * -np.expm1(-np.maximum(since, 0.0) / 0.5e-3) + wrong(since), 0.0)
+    motion, bands = texture + np.roll(base, 1), make_bands(100.0, 0.0)
+    position = np.where(touching, 0.0, np.nan)
+    signals = make_signals(bands, 0.0, extra=motion[:, None], position=position) | {"reference": texture}
+    summary = summary_of(bands, signals, {"unit": "N"}, settle=settle)
+    assert summary["verdict"] == verdict, summary["reason"]
+
+
+def test_a_stored_play_of_826e4c4_that_passed_then_fails():
+    """White noise of 5 um by the default of commit 826e4c4, whose verdict was "within its tolerance".
+
+    From 0.5 to 1.5 s of `Recorded(file=..., gain=...)` without a finger, in nm: six carriers, with amplitudes right
+    within 9 %, and a third of the texture's energy.
+    """
+    stored = np.load(Path(__file__).parent / "goldens/h2_826e4c4.npz")
+    reference, motion = (1e-9 * stored[name].astype(float) for name in ("reference", "motion"))
+    summary = make_play(reference, motion).summary()
+    assert summary["verdict"] == "failed"
+    error = np.std(motion[:, 0] - reference) / np.std(reference)
+    assert error > 1.0
+    assert summary["waveform"]["places"]["centre"]["waveform_error"] == pytest.approx(error, rel=0.02)
+    assert make_play(reference, np.repeat(reference[:, None], 3, axis=1)).summary()["verdict"] == "passed"

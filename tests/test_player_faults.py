@@ -7,11 +7,10 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, nullcontext
-from functools import partial
 
 import numpy as np
 import pytest
-from live_devices import LIES, RIDGES, TONE, Calling, Lying
+from live_devices import LIES, TONE, Calling, Lying
 from other_plate import OtherPlate
 
 import hapticrender as hr
@@ -499,33 +498,3 @@ def test_a_program_that_ends_before_its_with_statement_leaves_zero_drive(enter, 
     assert drive[:-2].any()
     assert not drive[-1].any()
     assert len(Recording.load(journal)) >= 1500
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
-def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, status):
-    """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
-    scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.1), duration=100.0, name="live")
-    (tmp_path / "live.toml").write_text(scene.to_toml())
-    command = [sys.executable, "-m", "hapticrender", "play", "live.toml", "--out", "out"]
-    number = getattr(signal, name)
-    run = subprocess.Popen(
-        command,
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd()},
-        preexec_fn=partial(signal.signal, number, signal.SIG_DFL),  # also where whoever runs the tests ignores it
-    )
-    line = run.stdout.readline()
-    assert "Hz  target" in line
-    run.send_signal(number)
-    printed, complaint = run.communicate(timeout=120)
-    assert run.returncode == status
-    assert "page: " in printed
-    if name == "SIGINT":
-        assert "interrupted" in complaint
-    recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
-    assert len(recording) > 0.2 * recording.rate
-    assert (tmp_path / "out" / "index.html").exists()
