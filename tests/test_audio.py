@@ -192,8 +192,7 @@ def test_block_and_rate_are_options_of_the_text():
     profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0})
     assert open_driver("audio:0?drive_per_full_scale=1.5", profile).drive_limit == 1.5
     assert str(open_driver("audio:0?block=64")) == "audio:0"
-    with pytest.raises(ValueError, match="driver = 'audio:0.blok=64': .*unexpected keyword argument 'blok'"):
-        open_driver("audio:0?blok=64")
+    assert open_driver("audio:what?blok=64").device == "what?blok=64"  # no option of a card: a part of its name
     with pytest.raises(ValueError, match="block='many' must be a whole number >= 1"):
         open_driver("audio:0?block=many")
 
