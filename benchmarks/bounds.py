@@ -11,6 +11,8 @@ Run: python -m benchmarks.bounds
 2. The comb's first half second: 0.8 N within a sample on the damped plate; its sag rings, and nothing else is wrong.
 3. Touch and lift: an exact inverse, the wrong one (of the plate before) until `late` after the contact or its end, and
    a damper on the error all the while.  Sags are not compensated.
+4. A target of 0.1 um whose amplitude is learned from N = 400 s of two sensors with noise sigma = 1 um alone: the
+   Cramer-Rao bound ``sigma sqrt(2/N)/sqrt(2)``.
 """
 
 from __future__ import annotations
@@ -151,6 +153,7 @@ def main() -> None:
         figures = " / ".join(f"{each:.1%}" for each in touch_figures(late, loaded, seed))
         what = f"exact from the {since} on, {'' if loaded else 'no '}load, phases of seed {seed}"
         print(f"touch and lift, {what}: middle / finger / end {figures}")
+    print(f"0.1 um in 1 um of noise, from 400 s of two sensors: {1e-6 / np.sqrt(400 * RATE) / 1e-7:.2%}")
 
 
 if __name__ == "__main__":
