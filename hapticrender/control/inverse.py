@@ -124,7 +124,7 @@ def prior(model: DeviceModel) -> tuple[Array, Array]:
     mean, sigma = np.zeros(PARAMETERS), np.zeros(PARAMETERS)
     k, m = model.stiffness[0, 0], model.mass[0, 0] * OMEGA_N**2
     c = max(0.3 * model.damping[0, 0], 0.02 * math.sqrt(model.stiffness[0, 0] * model.mass[0, 0])) * OMEGA_N
-    sigma[HEAVE : HEAVE + 4] = 0.025 * k, c, 0.015 * m, 1.0
+    sigma[HEAVE : HEAVE + 4] = 0.05 * k, c, 0.05 * m, 1.0
     sigma[LOAD] = LOAD_SIZE[0]
     if len(model.mass) > 1:
         k, m, c = model.stiffness[1, 1], model.mass[1, 1] * OMEGA_N**2, c
