@@ -3,8 +3,6 @@
 The library is the system's (``libportaudio``), or that which the package sounddevice brings on Windows and macOS.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -101,7 +99,7 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {  # name: result, arguments
 }
 
 
-LEFT_BEHIND: list[Stream] = []  # streams that PortAudio did not close
+LEFT_BEHIND: list["Stream"] = []  # streams that PortAudio did not close
 
 
 @dataclass(frozen=True)

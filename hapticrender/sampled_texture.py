@@ -9,8 +9,6 @@ again and again, for where the finger will be, and hands it over through a tripl
 over what it replaces.
 """
 
-from __future__ import annotations
-
 import ctypes
 from functools import partial
 from typing import Any

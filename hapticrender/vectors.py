@@ -7,8 +7,6 @@ Vectors take + - * / with vectors and numbers, real ones comparisons, which make
 Everything here is numba's documented extension interface and llvmlite's builder; LLVM chooses the registers.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any

@@ -5,8 +5,6 @@ observer leave of the phase, DC estimate <= f0/8.  Thresholds follow the noise. 
 margins; then all of it is lowered until the margins of the sampled loop hold (`margin_check`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -70,7 +68,7 @@ class Rules:
     medium_time: float = 0.4
     release: float = 0.05
 
-    def scaled(self, factor: float) -> Rules:
+    def scaled(self, factor: float) -> "Rules":
         """Return the rules for a device that is to be followed `factor` times as fast."""
         rates: dict[str, Any] = {
             name: tuple(factor * each for each in getattr(self, name))

@@ -5,8 +5,6 @@ what a bending mode of the surface adds to what the sensors show (docs/theory.md
 coordinates is left out; no finger raises Ms.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -44,7 +42,7 @@ class BendingMode:
     def __post_init__(self) -> None:
         require(0 <= self.spread < self.frequency, "spread", self.spread, f"between 0 and {self.frequency:g} Hz")
 
-    def corners(self) -> tuple[BendingMode, ...]:
+    def corners(self) -> tuple["BendingMode", ...]:
         """Return the mode at either end of its spread, and with either sign where it is an estimate."""
         return tuple(
             replace(self, frequency=self.frequency + shift, coupling=tuple(sign * each for each in self.coupling))

@@ -15,8 +15,6 @@ finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner 
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 
-from __future__ import annotations
-
 from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, contact_lag, track_finger, update_targets

@@ -6,8 +6,6 @@ Over a block the envelopes are held, and the innovations of the sample-by-sample
 force to the next's.  The inner damper needs the next sample and runs with M = 1 only.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import carray
 

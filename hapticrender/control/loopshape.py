@@ -5,8 +5,6 @@ drives the plant, which a look-up table or an inverse makes 1 (docs/theory.md, "
 ``T = C/(1 + L C)`` and ``C = T/(1 - L T)``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -49,7 +47,7 @@ class TransferFunction:
         """Value at complex `s` (rad/s)."""
         return np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
 
-    def __mul__(self, other: TransferFunction) -> TransferFunction:
+    def __mul__(self, other: "TransferFunction") -> "TransferFunction":
         return TransferFunction(
             tuple(np.polymul(self.numerator, other.numerator)), tuple(np.polymul(self.denominator, other.denominator))
         )

@@ -12,8 +12,6 @@ theta_D, delay and hold.  Complex: V = C[shape R - X], or V = shape R + C[-X] of
 F = rho D(jw) V, or rho (D V + D' dV/dt + j dw/dt M V), of the free device; see `laws` for rho.
 """
 
-from __future__ import annotations
-
 import math
 
 from numba import carray

@@ -1,7 +1,5 @@
 """Check the margins of the error observer's law at each level of the gain schedule, and lower its bandwidth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 

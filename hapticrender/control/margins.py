@@ -9,8 +9,6 @@ References
 Astrom and Murray, Feedback Systems, 2nd ed., 2021, chapters 10 and 13.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,12 +41,12 @@ class Margins:
     bandwidth: float = math.inf  # Hz: so close to every carrier S stays below 1/sqrt 2; inf where there is no carrier
 
     @classmethod
-    def unstable(cls) -> Margins:
+    def unstable(cls) -> "Margins":
         """Return the margins of a loop with a growing pole."""
         return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
 
     @classmethod
-    def smallest(cls, found: list[Margins]) -> Margins:
+    def smallest(cls, found: list["Margins"]) -> "Margins":
         """Return the smallest of every margin, each for itself."""
         smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
         least = min(found, key=lambda margins: margins.modulus)

@@ -13,8 +13,6 @@ resonant        one integrator a band and coordinate, no low pass; then D V + D'
 All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, ClassVar

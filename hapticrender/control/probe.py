@@ -7,8 +7,6 @@ hypotheses h (13 wirings, each with 13 delays, free and with a finger at either 
 second differences in the second half of the silence after it; its energy is none of the response's.
 """
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple

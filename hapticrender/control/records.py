@@ -11,8 +11,6 @@ Fields of a coordinate, and of the law between two, are numbered in a tile (``e0
 their own, see `coordinates_of`.  A device of one coordinate leaves the other's at zero.
 """
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from numba import carray

@@ -5,8 +5,6 @@ device, and its supervisor's memory (tests, heat, a stop), lie in blocks of memo
 one; `transfer` copies them when that one takes over.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 The tests themselves, and their conditions, are in `supervisor_kernel`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple

@@ -36,8 +36,6 @@ damper; 8 a limit.  Without them a controller has tests 1 and 2.  Causes have th
 the device's limit of rms drive, where it has one.  `control.supervisor` designs all of it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

@@ -8,8 +8,6 @@ on the contact area.  Over a substep h the current is I cos(theta + w u) plus a 
 The carrier turns a whole number of times in a sample, so every sample starts at theta = 0.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

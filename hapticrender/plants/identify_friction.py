@@ -13,8 +13,6 @@ model leaves (turns of the finger, skin) is not white: its intervals come from t
 periods of the modulation (the cluster-robust covariance of Liang & Zeger 1986).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import NamedTuple

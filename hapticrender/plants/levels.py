@@ -6,8 +6,6 @@ stiffness of the lesser level in heave and rocking, the force D r for the target
 largest of their envelopes, over bands, places and path, relative to the band's target.  Nothing is simulated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
