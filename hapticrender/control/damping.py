@@ -183,12 +183,7 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def choose_damping(
-    model: DeviceModel,
-    *,
-    bending: BendingMode | None = None,
-    apart: bool = False,
-) -> Damping:
+def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, apart: bool = False) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
