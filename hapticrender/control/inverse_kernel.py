@@ -41,7 +41,7 @@ from hapticrender.control.inverse_records import (
 )
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
-from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
+from hapticrender.control.peak_limit import NONFINITE, SATURATED, drive_of, shape_noise
 from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, PAST_MASK, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit

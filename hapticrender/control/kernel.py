@@ -24,7 +24,7 @@ from hapticrender.control.carriers import (
     update_targets,
 )
 from hapticrender.control.laws import apply_law, follow_resonance, update_law
-from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, UNLOCKED, largest_drive, limit_drive
+from hapticrender.control.peak_limit import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, UNLOCKED, largest_drive, limit_drive
 from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,

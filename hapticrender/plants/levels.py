@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from hapticrender.bands import Bands
 from hapticrender.defaults import LOWEST_FREQUENCY
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
-from hapticrender.plants.gap import VACUUM
+from hapticrender.plants.gap_estimator import VACUUM
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.protocols import Array

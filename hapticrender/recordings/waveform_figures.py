@@ -38,12 +38,10 @@ EDGE = 2.0 ** (1 / 6)
 CURVE = "classic"  # detection threshold; the rounding of a 12-bit converter alone is 1.4 times the safe one at 200 Hz
 SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is known
 LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
-UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
 LANDING = 3e-3  # s: five memory lengths of a contact at 20 mm/s, in which the friction of a touch builds up
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
-MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
 
 @np.errstate(**DIVERGING)
