@@ -113,6 +113,7 @@ load lever contact law_contact law_lever finger_mass finger_damping finger_stiff
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
 gain damping_gain damper_scale dc_fast_on feedback_off
 """.split()
+_ARRAYS = "tiles loops commands setpoints work table phasors samples window gains"
 CONTROLLER = np.dtype(
     [
         ("p", SETTINGS),
@@ -121,21 +122,7 @@ CONTROLLER = np.dtype(
         ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "moving", "stale", "implausible")),
-        *(
-            (name, np.int64)
-            for name in (
-                "tiles_at",
-                "loops_at",
-                "commands_at",
-                "setpoints_at",
-                "work_at",
-                "table_at",
-                "phasors_at",
-                "samples_at",
-                "window_at",
-                "gains_at",
-            )
-        ),
+        *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
 )
 """Settings and state of a controller, and the addresses of its arrays."""
