@@ -42,7 +42,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.control.gains import MOST, check_gains, start_gains
+from hapticrender.control.gain_faults import MOST, check_gains, start_gains
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag

@@ -25,7 +25,7 @@ from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.fitting import as_real
 from hapticrender.plants.identify import SIGMAS_95, Estimate, play
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.touch.finger import Finger
 

@@ -18,7 +18,7 @@ from hapticrender.defaults import LOWEST_FREQUENCY
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.gap_estimator import VACUUM
 from hapticrender.plants.plate import PlateParameters, structure
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import NONE, FingerMechanics

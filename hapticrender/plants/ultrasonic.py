@@ -1,8 +1,8 @@
 """An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
 The finger adds damping and shifts the resonance, both with the cube root of its load; the friction that it leaves is
-that of `surface`.  At level "envelope" the mode is moved down, with the same envelope for the same controller at a
-fraction of the rate (docs/theory.md, "Ultrasonic mode").
+that of `ultrasonic_surface`.  At level "envelope" the mode is moved down, with the same envelope for the same
+controller at a fraction of the rate (docs/theory.md, "Ultrasonic mode").
 """
 
 import math
