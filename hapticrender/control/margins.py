@@ -161,6 +161,8 @@ def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | No
     peak = sensitivity(values)
     highest, where = highest_peak(lambda frequency: sensitivity(loop(frequency)), grid, peak)
     delay, phase, gain = borne_errors(grid, values)
+    wide = grid[peak >= math.sqrt(0.5)]
+    widths = [np.abs(wide - carrier).min(initial=np.inf) for carrier in ([] if carriers is None else carriers)]
     return Margins(
         stable=True,
         modulus=1.0 / highest,
@@ -168,7 +170,7 @@ def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | No
         delay=delay,
         phase=phase,
         gain=gain,
-        bandwidth=math.inf if carriers is None else min(_halved_within(grid - carrier, peak) for carrier in carriers),
+        bandwidth=float(min(widths, default=math.inf)),
     )
 
 
@@ -229,8 +231,3 @@ def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
         more = min(more, factor[factor >= 1].min(initial=np.inf))
         less = max(less, factor[factor < 1].max(initial=0.0))
     return float(delay), float(min(phase, np.pi)), float(min(more, 1 / less if less else np.inf))
-
-
-def _halved_within(offset: Array, peak: Array) -> float:
-    """Smallest |offset| (Hz) at which `peak`, the largest singular value of S there, reaches 1/sqrt 2."""
-    return float(np.abs(offset)[peak >= math.sqrt(0.5)].min(initial=np.inf))

@@ -82,7 +82,8 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
         columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
         alike = float(weights @ power[:, i] / (weights @ power[:, 0]))
         whole_error = math.sqrt(max(alike, total[i] / total[0]))
-        errors = {"waveform_error": whole_error, "window_error": _windows(power[:, [0, i]])}
+        each = power[:, i] / np.maximum(power[:, 0], QUIET**2 * power[:, 0].mean())  # of quiet windows that loud
+        errors = {"waveform_error": whole_error, "window_error": float(np.sqrt(np.percentile(each, WORST_WINDOWS)))}
         thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, rms, i - 1), share)
         found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))
@@ -180,13 +181,6 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
         power += scale * np.abs(np.hstack([turned, turned[:, 1:] + shares / scales * turned[:, :1]])) ** 2
         cross += scale * turned[:, 0].conj() * turned[:, 1]
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
-
-
-def _windows(power: Array) -> float:
-    """95th percentile of ``rms_B(e)/max(rms_B(r), 0.1 of that of the whole play)`` in windows of 100 ms."""
-    reference, error = power.T
-    each = error / np.maximum(reference, QUIET**2 * reference.mean())
-    return float(np.sqrt(np.percentile(each, WORST_WINDOWS)))
 
 
 def _thirds(
