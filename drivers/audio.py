@@ -153,7 +153,6 @@ class AudioDriver(BaseDriver):
             )
 
     def _open(self) -> None:
-        """Open the card and start its stream, which plays zeros."""
         self.check_calibrated()
         output, inputs = self._side(self.channels, 1), self._side(self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)

@@ -158,7 +158,6 @@ class SerialDriver(BaseDriver):
         self._started = client.clock.monotonic()
 
     def _point(self) -> None:
-        """Send where the finger is now."""
         if self.finger is None:
             return
         clock = self.client.clock.monotonic()

@@ -97,8 +97,6 @@ FUSED = _of_llvm("fma")  # a b + c
 
 
 def _each(name: str) -> Callable[..., Any]:
-    """Sum or difference."""
-
     def act(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
         combine = getattr(builder, name)
         imag = None if b is y is None else combine(*(ZERO if each is None else each for each in (b, y)))

@@ -131,7 +131,6 @@ def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str
 
 
 def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
-    """Refuse a recording that is not of such a plate."""
     header = recording.header
     if header.sensed_channels != 2 or header.unit != "m":
         found = f"{header.sensed_channels} sensors in {header.unit}"

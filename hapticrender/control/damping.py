@@ -282,6 +282,5 @@ def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode 
 
 
 def _off(coordinates: int, reason: str) -> Damping:
-    """No damper."""
     taps, none = np.zeros((coordinates, TAPS)), np.zeros(coordinates)
     return Damping(taps=taps, added_damping=none, quality=math.inf, margins=(), noise=(), note=f"off: {reason}")
