@@ -5,8 +5,6 @@ of the set-up: the drive and the displacement at full scale, and the delay of th
 ``hapticrender latency --driver audio:NAME`` measures through a cable.
 """
 
-from __future__ import annotations
-
 import atexit
 import copy
 import time
@@ -124,13 +122,13 @@ class AudioDriver(BaseDriver):
         """Samples of `delay` that the card itself does not have: `queued`, of a driver for `play`; else 0."""
         return self.delay - (self.play_delay - self.queued)
 
-    def live(self) -> AudioDriver:
+    def live(self) -> "AudioDriver":
         """Make the same driver for a compiled controller: its `delay` is the card's, `play_delay` is that of `play`."""
         driver = copy.copy(self)
         driver.delay = self.play_delay - self.queued
         return driver
 
-    def loop_back(self) -> AudioDriver:
+    def loop_back(self) -> "AudioDriver":
         """Make a driver of the first output and the first input (1 unless given), both in full scales."""
         options = {"rate": self.rate, "block": self.block, "latency": self.latency, "delay": float(self.block)}
         channels, inputs = self.channels[:1], (self.inputs or (1,))[:1]
@@ -155,7 +153,6 @@ class AudioDriver(BaseDriver):
             )
 
     def _open(self) -> None:
-        """Open the card and start its stream, which plays zeros."""
         self.check_calibrated()
         output, inputs = self._side(self.channels, 1), self._side(self.inputs, 0)
         self._relay = Relay(*(tuple(n - 1 for n in each) for each in (self.inputs, self.channels)), self.block)

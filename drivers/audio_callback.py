@@ -6,8 +6,6 @@ and so do these while there is no function.  It is that of a ``RealtimeEntry``, 
 blocks with Python.
 """
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from numba import carray, types

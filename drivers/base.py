@@ -100,8 +100,6 @@ Nothing has to be inherited.  Here is a whole driver, a plate on two coils with 
 10.0 um
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self

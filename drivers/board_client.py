@@ -1,7 +1,5 @@
 """A board that plays textures, live: set-points, finger and gain from any thread, and what came of them."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

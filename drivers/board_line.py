@@ -1,7 +1,5 @@
 """A board on an open serial port: its session, the commands, and errors that name port, operation and bytes."""
 
-from __future__ import annotations
-
 import math
 import secrets
 import time

@@ -15,8 +15,6 @@ sent   then                                    reply behind the echo
 ====== ======================================= =====================================================
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple, Self
 

@@ -3,8 +3,6 @@
 The library is the system's (``libportaudio``), or that which the package sounddevice brings on Windows and macOS.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import sys
@@ -32,20 +30,17 @@ INSTALL = (
 )
 
 
+def _fields(names: str, *kinds: Any) -> tuple[tuple[str, Any], ...]:
+    return tuple(zip(names.split(), kinds, strict=True))
+
+
 class DeviceInfo(Structure):
     """PaDeviceInfo."""
 
     _fields_ = (
-        ("structVersion", c_int),
-        ("name", c_char_p),
-        ("hostApi", c_int),
-        ("maxInputChannels", c_int),
-        ("maxOutputChannels", c_int),
-        ("defaultLowInputLatency", c_double),
-        ("defaultLowOutputLatency", c_double),
-        ("defaultHighInputLatency", c_double),
-        ("defaultHighOutputLatency", c_double),
-        ("defaultSampleRate", c_double),
+        *_fields("structVersion name hostApi maxInputChannels maxOutputChannels", c_int, c_char_p, *[c_int] * 3),
+        *_fields("defaultLowInputLatency defaultLowOutputLatency", c_double, c_double),
+        *_fields("defaultHighInputLatency defaultHighOutputLatency defaultSampleRate", *[c_double] * 3),
     )
 
 
@@ -53,30 +48,23 @@ class HostApiInfo(Structure):
     """PaHostApiInfo."""
 
     _fields_ = (
-        ("structVersion", c_int),
-        ("type", c_int),
-        ("name", c_char_p),
-        ("deviceCount", c_int),
-        ("defaultInputDevice", c_int),
-        ("defaultOutputDevice", c_int),
+        *_fields("structVersion type name", c_int, c_int, c_char_p),
+        *_fields("deviceCount defaultInputDevice defaultOutputDevice", *[c_int] * 3),
     )
 
 
 class HostErrorInfo(Structure):
     """PaHostErrorInfo."""
 
-    _fields_ = (("hostApiType", c_int), ("errorCode", ctypes.c_long), ("errorText", c_char_p))
+    _fields_ = _fields("hostApiType errorCode errorText", c_int, ctypes.c_long, c_char_p)
 
 
 class StreamParameters(Structure):
     """PaStreamParameters."""
 
     _fields_ = (
-        ("device", c_int),
-        ("channelCount", c_int),
-        ("sampleFormat", c_ulong),
-        ("suggestedLatency", c_double),
-        ("hostApiSpecificStreamInfo", c_void_p),
+        *_fields("device channelCount sampleFormat", c_int, c_int, c_ulong),
+        *_fields("suggestedLatency hostApiSpecificStreamInfo", c_double, c_void_p),
     )
 
 
@@ -101,7 +89,7 @@ FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {  # name: result, arguments
 }
 
 
-LEFT_BEHIND: list[Stream] = []  # streams that PortAudio did not close
+LEFT_BEHIND: list["Stream"] = []  # streams that PortAudio did not close
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,6 @@ A frame is ``COBS(kind, sequence, payload, CRC-16), 0``; everything is little-en
 a command, from host to board, ends with a CRC-32 that starts from the session (`check_value`).
 """
 
-from __future__ import annotations
-
 import struct
 from binascii import crc32, crc_hqx
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Rows that a board streams back, in order."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from hapticrender.drivers.protocol import WRAP, Stream

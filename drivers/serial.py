@@ -5,8 +5,6 @@ behind the driver protocol, so that ``hapticrender.render`` plays a scene on the
 The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's part.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -69,12 +67,12 @@ class SerialDriver(BaseDriver):
             delay=found.delay + (2 * block if block > 1 else 0),
         )
 
-    def driven_by_host(self) -> SerialDriver:
+    def driven_by_host(self) -> "SerialDriver":
         """Return the same board as a device that plays the drive of the host, for identification."""
         return self if self.block > 1 else SerialDriver(self.client.port, block=HOST_BLOCK, **self.options)
 
     @contextmanager
-    def by_host(self) -> Iterator[SerialDriver]:
+    def by_host(self) -> Iterator["SerialDriver"]:
         """Let the open board play the drive of the host, and leave it at rest."""
         board = copy(self)
         if self.block == 1:
@@ -160,7 +158,6 @@ class SerialDriver(BaseDriver):
         self._started = client.clock.monotonic()
 
     def _point(self) -> None:
-        """Send where the finger is now."""
         if self.finger is None:
             return
         clock = self.client.clock.monotonic()

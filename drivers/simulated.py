@@ -1,7 +1,5 @@
 """The default driver: a plant model behind the driver protocol."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from hapticrender.drivers.base import BaseDriver

@@ -3,8 +3,6 @@
 A file is a device without sensors: the controller drives it open loop.  A sample of 1.0 in the file is `full_scale`.
 """
 
-from __future__ import annotations
-
 from contextlib import suppress
 from pathlib import Path
 

@@ -202,13 +202,7 @@ def mapping(check: Callable[[str, Any], Any], about: str = "") -> Any:
 
 
 def parameter(
-    default: Any = MISSING,
-    unit: str = "",
-    about: str = "",
-    *,
-    above: End = None,
-    least: float = 0.0,
-    most: End = None,
+    default: Any = MISSING, unit: str = "", about: str = "", *, above: End = None, least: float = 0.0, most: End = None
 ) -> Any:
     """Field of a `Validated` class: a number (integer where annotated so) > `above` or >= `least`, <= `most`."""
     low: dict[str, Any] = {"least": least} if above is None else {"above": above}

@@ -51,8 +51,6 @@ def _path(text: str) -> Path:
 
 
 def _whole(least: int, most: int) -> Any:
-    """Reader of a whole number from `least` to `most`."""
-
     def read(text: str) -> int:
         if not (text.isascii() and text.isdigit() and len(text) <= 18 and least <= int(text) <= most):
             raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from {least} to {most}")

@@ -10,8 +10,6 @@ A plant, a controller and an audio callback therefore meet without knowing each 
 addresses closes any plant with any controller, and a third party may give a step written in C.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 import threading

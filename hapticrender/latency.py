@@ -51,11 +51,6 @@ class Latency:
     queued: int = 0  # samples that the driver's `play` adds
 
     @property
-    def round_trip(self) -> float:
-        """Median over the runs (samples), of a block played to the same block sensed."""
-        return statistics.median(trip.samples for trip in self.trips)
-
-    @property
     def spread(self) -> float:
         """Largest less smallest round trip (samples)."""
         found = [trip.samples for trip in self.trips]
@@ -69,7 +64,7 @@ class Latency:
     @property
     def delay(self) -> float:
         """Delay of the device's loop (samples), the driver's argument `delay`."""
-        return self.block + self.round_trip - 0.5 - self.queued
+        return self.block + statistics.median(trip.samples for trip in self.trips) - 0.5 - self.queued
 
     def __str__(self) -> str:
         milliseconds = 1e3 * self.delay / self.rate

@@ -1,7 +1,5 @@
 """The loop of live play: driver and controller of a rendering, block by block, through the real-time entry."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Which part of a playlist plays live, and until when."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Threads of live play: what runs until a player stops, and a device without a clock of its own, held to the clock."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

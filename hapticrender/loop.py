@@ -1,7 +1,5 @@
 """The loop: scene -> renderer -> controller -> driver -> device, file or plant, and back; it counts samples."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import os

@@ -12,8 +12,6 @@ A texture fades into the next one under the same controller, which keeps what it
 Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.
 """
 
-from __future__ import annotations
-
 import atexit
 import math
 import threading

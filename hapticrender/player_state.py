@@ -1,7 +1,5 @@
 """What a player does at the moment, for the application and for the terminal."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

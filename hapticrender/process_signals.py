@@ -3,8 +3,6 @@
 The first one raises an exception there; further ones wait until what plays is at rest and closed.
 """
 
-from __future__ import annotations
-
 import atexit
 import signal
 import sys

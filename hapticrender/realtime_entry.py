@@ -15,8 +15,6 @@ Three slots, one writer and one reader: the writer fills its own slot and swaps 
 swaps its own for that where it is fresh, each in one atomic step.  No slot is read while it is written.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from typing import Any

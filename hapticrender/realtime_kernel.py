@@ -3,8 +3,6 @@
 `realtime_entry.RealtimeEntry` makes the records and says what they are for.
 """
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from numba import carray, types

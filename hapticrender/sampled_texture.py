@@ -9,8 +9,6 @@ again and again, for where the finger will be, and hands it over through a tripl
 over what it replaces.
 """
 
-from __future__ import annotations
-
 import ctypes
 from functools import partial
 from typing import Any
@@ -186,12 +184,7 @@ class EvaluatedTexture(Addressed):
 
     def _describe(self, **values: Any) -> None:
         self.record = record_of(
-            TEXTURE,
-            samples_at=self._samples,
-            length=len(self._samples),
-            back=-FOREVER,
-            follows=self._follows,
-            **values,
+            TEXTURE, samples_at=self._samples, length=len(self._samples), back=-FOREVER, follows=self._follows, **values
         )
         self.address = int(self.record.ctypes.data)
 

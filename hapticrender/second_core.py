@@ -6,8 +6,6 @@ Where another one takes longer than a load from the cache does, a child process 
 becomes of the child (killed, no right to write, no second core), what is not in the cache is compiled here.
 """
 
-from __future__ import annotations
-
 import atexit
 import os
 import re

@@ -7,8 +7,6 @@ Vectors take + - * / with vectors and numbers, real ones comparisons, which make
 Everything here is numba's documented extension interface and llvmlite's builder; LLVM chooses the registers.
 """
 
-from __future__ import annotations
-
 import operator
 from collections.abc import Callable
 from typing import Any
@@ -99,8 +97,6 @@ FUSED = _of_llvm("fma")  # a b + c
 
 
 def _each(name: str) -> Callable[..., Any]:
-    """Sum or difference."""
-
     def act(builder: Any, a: Any, b: Any, x: Any, y: Any) -> tuple[Any, Any]:
         combine = getattr(builder, name)
         imag = None if b is y is None else combine(*(ZERO if each is None else each for each in (b, y)))

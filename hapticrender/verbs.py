@@ -36,7 +36,6 @@ PICTURES_HINT = 'no pictures without matplotlib; to get them: pip install "hapti
 
 
 def _made(path: Path) -> Path:
-    """Return `path`, its folder made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -362,7 +361,6 @@ def _recording(path: Path) -> Recording:
 
 
 def _scene(reference: str) -> Scene:
-    """Read a scene: a built-in one by its name, any other from its file."""
     with naming(reference):
         return validation.open_scene(reference)
 

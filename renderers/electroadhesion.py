@@ -2,8 +2,8 @@
 
 The target quantity is friction (N); the drive is an attraction (N) around a bias, which the square root turns into the
 envelope of the current on the carrier.  A driver of your own gets that envelope (A, peak), for an external modulator,
-or the carrier itself; it senses friction (N) on a tribometer, the attraction (N) that `plants.gap` computes from
-voltage and current, or nothing.
+or the carrier itself; it senses friction (N) on a tribometer, the attraction (N) that `plants.gap_estimator` computes
+from voltage and current, or nothing.
 """
 
 from dataclasses import dataclass, replace

@@ -15,8 +15,8 @@ from hapticrender.control.supervisor import Fault, supervised
 from hapticrender.driver_checks import check_channels, check_sensed
 from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
 from hapticrender.plants.friction_laws import friction_ratios, reference_amplitudes
-from hapticrender.plants.surface import SurfaceParameters, full_slew
 from hapticrender.plants.ultrasonic_kernels import amplitude_decay, references_within_reach
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters, full_slew
 from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger

@@ -14,8 +14,8 @@ from hapticrender.checks import inside, require
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.plants.friction_laws import LAWS
-from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.protocols import Driver
 from hapticrender.renderers.base import check_tables, read_devices
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit

@@ -11,8 +11,8 @@ from hapticrender.jit import F8, SIGNALS_T, pointer, record_of, step
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.plants.plate import Plate, PlateParameters
-from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.touch.mechanics import HEAVY
 
 MASS = np.dtype([("position", "f8"), ("velocity", "f8"), ("stiffness", "f8"), ("mass", "f8"), ("period", "f8")])

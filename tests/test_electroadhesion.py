@@ -13,7 +13,7 @@ from hapticrender.plants.electroadhesion import (
     ElectroadhesionScreen,
     SquareRoot,
 )
-from hapticrender.plants.gap import VACUUM, estimate_attraction, gap_record
+from hapticrender.plants.gap_estimator import VACUUM, estimate_attraction, gap_record
 
 RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.05, normal_load=1.0)

@@ -10,7 +10,7 @@ from test_ultrasonic_rendering import friction_of, watched
 import hapticrender as hr
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.plants.identify_friction import identify_screen
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 RATE = 5000.0
 MUST = 0.03  # of the waveform: what the project has set itself

@@ -10,7 +10,7 @@ from waves import phasor
 
 import hapticrender as hr
 from hapticrender.plants.electroadhesion import MOIST, NORMAL, ElectroadhesionParameters
-from hapticrender.plants.gap import estimate_attraction, gap_record
+from hapticrender.plants.gap_estimator import estimate_attraction, gap_record
 
 LOAD, SPEED, REST, FORCE = 1.0, 0.05, 0.2, 0.1  # N, m/s, s, N of friction
 FINGER = hr.Finger.sampled([0.0, 0.0, 0.1], times=[0.0, REST, REST + 0.1 / SPEED], normal_load=LOAD)

@@ -10,7 +10,7 @@ import hapticrender as hr
 from hapticrender import cli
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.identify_friction import identify_resonance, identify_screen
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 
 class Resonator(Bench):

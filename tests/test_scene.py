@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.errors import SceneError
-from hapticrender.touch import toml
+from hapticrender.touch import toml_text
 from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
@@ -272,7 +272,7 @@ def spoiled(tables):
 
 @given(spoiled(GOOD_TEXTURES), spoiled(GOOD_FINGERS))
 def test_no_nearly_good_scene_is_a_traceback(texture, finger):
-    accept_or_refuse(toml.dumps({"duration": 1.0, "texture": texture, "finger": finger}))
+    accept_or_refuse(toml_text.dumps({"duration": 1.0, "texture": texture, "finger": finger}))
 
 
 @given(st.text(max_size=60) | st.text(alphabet="=[]{}\"'.,#\n ae0-", max_size=60))

@@ -12,7 +12,7 @@ from strangers_plate import StrangersPlate
 import hapticrender as hr
 from benchmarks import faults
 from benchmarks.false_stops import random_scene, run
-from hapticrender.control.gains import WANDER, design_gains
+from hapticrender.control.gain_faults import WANDER, design_gains
 from hapticrender.mathx import zoh
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND

@@ -15,8 +15,8 @@ import hapticrender as hr
 from hapticrender.control.controller import BankController
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
-from hapticrender.plants.surface import SurfaceParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Flag
 from hapticrender.renderers.ultrasonic import amplitude_loop
 

@@ -7,8 +7,8 @@ from proportional import Proportional
 import hapticrender as hr
 from hapticrender.plants.friction_laws import friction_ratio, reference_amplitude
 from hapticrender.plants.sliding_contact import sliding_record, sliding_step
-from hapticrender.plants.surface import SurfaceParameters, UltrasonicSurface, full_slew
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters, UltrasonicSurface, full_slew
 from hapticrender.protocols import Flag
 
 QUIET = UltrasonicParameters(sensor_noise=0.0, sensor_bits=0, drive_bits=0)

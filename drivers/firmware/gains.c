@@ -1,4 +1,4 @@
-/* Tests of the gains of sensors and actuators; as hapticrender/control/gains.py. */
+/* Tests of the gains of sensors and actuators; as hapticrender/control/gain_faults.py. */
 #include "gains.h"
 
 #include <string.h>

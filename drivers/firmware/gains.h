@@ -1,6 +1,6 @@
 /*
  * Supervision of gains: whether a sensor shows, or an actuator gives, a multiple of what it did, or another's, as
- * hapticrender/control/gains.py, which has the equations.
+ * hapticrender/control/gain_faults.py, which has the equations.
  *
  * Index of an array of two: of sensors, or of actuators; of the outer one: sensors, actuators.  Of an array of
  * GAIN_CHANGES: of the one, of the other, and a swap of the two.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from hapticrender.loop import registered, render
-from hapticrender.plants.surface import UltrasonicSurface
+from hapticrender.plants.ultrasonic_surface import UltrasonicSurface
 from hapticrender.protocols import Array, Flag, Sensed
 from hapticrender.recordings.envelopes import amplitude_error, fit
 from hapticrender.recordings.recording import Recording

@@ -96,7 +96,8 @@ def analyse_finger(
         course = course.regressed(lines, signals.noise) if frequency.size else course
         rest = course.rest(lines)
     touch, tracker = signals.track(course, rest)
-    spoiled = _spoiled(recording)[: len(touch.contact)]
+    bad = (recording.flags & int(Flag.OVERRUN | Flag.NONFINITE | Flag.TWO_TOUCHES)) > 0  # what is near is doubtful, too
+    spoiled = maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * rate) + 1)[: len(touch.contact)] > 0
     touch = replace(touch, contact=np.where(spoiled, DOUBTFUL, touch.contact))
     impedance = signals.impedance(course, touch, recording.bands, frequency, length, recording.header.calibration)
     edges = np.r_[0, np.flatnonzero(np.diff(touch.contact)) + 1, len(touch.contact)]
@@ -109,12 +110,6 @@ def analyse_finger(
         least_load=tracker.least_load(MIDDLE, MILLIMETRE),
         notes=tuple(_notes(recording, course, touch, rest, impedance, threshold)),
     )
-
-
-def _spoiled(recording: Recording) -> Array:
-    """Samples (bool, (n,)) within `AROUND` of one that is lost, no number, or of two fingers."""
-    bad = (recording.flags & int(Flag.OVERRUN | Flag.NONFINITE | Flag.TWO_TOUCHES)) > 0
-    return np.asarray(maximum_filter1d(bad.astype(np.uint8), 2 * round(AROUND * recording.rate) + 1) > 0)
 
 
 def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str | os.PathLike[str] | None) -> Course:
@@ -136,7 +131,6 @@ def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str
 
 
 def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
-    """Refuse a recording that is not of such a plate."""
     header = recording.header
     if header.sensed_channels != 2 or header.unit != "m":
         found = f"{header.sensed_channels} sensors in {header.unit}"

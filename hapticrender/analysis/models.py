@@ -241,7 +241,9 @@ def _fit(samples: Samples, patterns: Array, order: int, second: FingerFit | None
         best = min(searches, key=lambda each: each.cost)
     numbers = fixed | dict(zip(names, (best.x[:count] * units).tolist(), strict=True))
     growth, chi_square, freedom = numbers.pop("load_exponent"), 2 * float(best.cost), best.fun.size - best.x.size
-    covariance = _inverse(best.jac)[:count, :count] * np.outer(units, units) * max(1.0, chi_square / max(freedom, 1))
+    _, size, right = np.linalg.svd(best.jac, full_matrices=False)
+    spread = right.T / np.maximum(size, 1e-12 * size[0])  # a direction without data: beyond every bound, not 0
+    covariance = (spread @ spread.T)[:count, :count] * np.outer(units, units) * max(1.0, chi_square / max(freedom, 1))
     reach = float(samples.load.min()), float(samples.load.max())
     return FingerFit(FingerMechanics(**numbers), growth, names, covariance, chi_square, freedom, reach)
 
@@ -263,10 +265,3 @@ def _starts(samples: Samples, second: FingerFit | None) -> list[Array]:
     matrix = np.vstack([real, imaginary])
     right = np.concatenate([samples.value.real, samples.value.imag]) * np.tile(weight, 2)
     return [np.append(np.linalg.lstsq(matrix, right, rcond=None)[0], 0.0)]
-
-
-def _inverse(jacobian: Array) -> Array:
-    """Inverse of J^T J; a direction without data has a variance beyond every bound, not 0."""
-    _, size, right = np.linalg.svd(jacobian, full_matrices=False)
-    spread = right.T / np.maximum(size, 1e-12 * size[0])
-    return spread @ spread.T

@@ -115,7 +115,6 @@ def _bands(record: FingerRecord) -> str:
 
 
 def _plate(record: FingerRecord) -> str:
-    """Parameters of the plate at both ends of the recording."""
     plate = record.plate
     rows = [["plate" if plate.measured else "plate (profile)", "at the start", "at the end", "standard errors"]]
     for name, values in plate.values.items():
@@ -209,7 +208,6 @@ def _exponent(n: float, error: float) -> str:
 
 
 def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
-    """Section of one recording."""
     touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
     plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
     count, length = len(record.of_kind(LOADED)), record.time[-1] - record.time[0]

@@ -122,7 +122,6 @@ def _shown(value: Array) -> list[int]:
 
 
 def _colours(count: int) -> list[Any]:
-    """Colours from low to high frequency, none of them too pale."""
     from matplotlib import colormaps
 
     return [colormaps["viridis"](0.9 * i / max(count - 1, 1)) for i in range(count)]
@@ -180,7 +179,6 @@ def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
 
 
 def _right(axes: Any) -> Any:
-    """Second axis of values, on the right."""
     right = axes.twinx()
     right.grid(False)
     right.spines["right"].set_visible(True)

@@ -5,8 +5,6 @@ the observer delays and filters motion, and the estimate in use when a command w
 one: neither delay nor observer closes a loop through the adaptation.  A step of adaptation is a block, or 8 samples.
 """
 
-from __future__ import annotations
-
 from hapticrender.control.laws import contact_damping
 from hapticrender.control.records import CONTROLLER_T, COORDINATE_T, PAIR_T, TILE_T, coordinates_of
 from hapticrender.jit import kernel, record

@@ -5,8 +5,6 @@ phase counted in turns at every refresh, and turned on by one product a sample b
 from the finger's position in every sample.  With M samples a block the carrier is that at the block's start.
 """
 
-from __future__ import annotations
-
 from numba import carray
 
 from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, TILE_T, WAVEFORM, W, samples_of

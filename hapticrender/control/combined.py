@@ -4,8 +4,6 @@ Each part has a controller of its own, of the same method, for its own bands; th
 their targets add up to the target of the skin's velocity, V = j w X + (v/F) F.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A bank of bands behind the `Controller` protocol: settings, state and a compiled step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

@@ -5,8 +5,6 @@ observer leave of the phase, DC estimate <= f0/8.  Thresholds follow the noise. 
 margins; then all of it is lowered until the margins of the sampled loop hold (`margin_check`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -70,7 +68,7 @@ class Rules:
     medium_time: float = 0.4
     release: float = 0.05
 
-    def scaled(self, factor: float) -> Rules:
+    def scaled(self, factor: float) -> "Rules":
         """Return the rules for a device that is to be followed `factor` times as fast."""
         rates: dict[str, Any] = {
             name: tuple(factor * each for each in getattr(self, name))
@@ -180,6 +178,7 @@ def _settings(
     lowest = lowest_carrier(model, bands)
     observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
     sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
+    decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.always_damped else math.inf
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
@@ -196,7 +195,8 @@ def _settings(
         "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
         "lock": 2 * math.pi * model.lock,
         "peak_decay": math.exp(-period * lowest),
-        "back_calculation": _back_calculation(model),
+        # of an always damped mode about as fast as it loses energy; however little, a finger takes it within 1 ms
+        "back_calculation": min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY)),
         "dc_fast": 1.6 * fast,
         "dc_drift_fast": fast**2,
         "age": (model.delay + 0.5) / ADAPTATION_SAMPLES,
@@ -242,15 +242,6 @@ def _finger(finger: FingerRange) -> dict[str, float]:
     }
     typical = {name: getattr(finger, name) for name in ("least_motion", "typical_mass", "typical_stiffness")}
     return {"contact_on": on, "contact_off": off, **typical, **bounds}
-
-
-def _back_calculation(model: DeviceModel) -> float:
-    """Rate (1/s) of the back-calculation; of an always damped mode about as fast as it loses energy.
-
-    However little that is, a finger takes it away within a millisecond.
-    """
-    decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.always_damped else math.inf
-    return min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY))
 
 
 def _in_blocks(settings: Mapping[str, Any], block: int, rate: float) -> dict[str, Any]:

@@ -5,8 +5,6 @@ what a bending mode of the surface adds to what the sensors show (docs/theory.md
 coordinates is left out; no finger raises Ms.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -44,7 +42,7 @@ class BendingMode:
     def __post_init__(self) -> None:
         require(0 <= self.spread < self.frequency, "spread", self.spread, f"between 0 and {self.frequency:g} Hz")
 
-    def corners(self) -> tuple[BendingMode, ...]:
+    def corners(self) -> tuple["BendingMode", ...]:
         """Return the mode at either end of its spread, and with either sign where it is an estimate."""
         return tuple(
             replace(self, frequency=self.frequency + shift, coupling=tuple(sign * each for each in self.coupling))
@@ -185,12 +183,7 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def choose_damping(
-    model: DeviceModel,
-    *,
-    bending: BendingMode | None = None,
-    apart: bool = False,
-) -> Damping:
+def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, apart: bool = False) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none, and why.
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
@@ -245,10 +238,15 @@ def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: Bendin
     if turns(parts) > 1.0:
         fastest = max(part.omega for part in parts) / (2 * np.pi)
         return _off(len(parts), f"{lag} is longer than a period of the mode at {fastest:.0f} Hz")
-    complaint = raised = ""
+    complaint, raised, spared, counts = "", "", "no bending mode is known", [plain]  # numbers of taps worth trying
+    if bending is not None:
+        spans = (1 + round(span * rate / bending.frequency) for span in REACHES) if any(bending.coupling) else (0,)
+        counts = sorted({min(max(TAPS + 2, each), MOST_TAPS) for each in spans})
+        known = "measured" if bending.measured else "estimated"
+        spared = f"taps spare the bending mode {known} at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
     for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
         quality = round(least_quality + step * QUALITY_STEP, 1)
-        designs = [damping_taps(parts, quality, bending, count, plain) for count in _counts(rate, bending, plain)]
+        designs = [damping_taps(parts, quality, bending, count, plain) for count in counts]
         complaints = [_complaint(parts, taps, bending) for taps in designs]
         kept = [damper_loops(parts, taps, bending) for taps, each in zip(designs, complaints, strict=True) if not each]
         if kept:
@@ -261,18 +259,11 @@ def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: Bendin
                 quality=quality,
                 margins=tuple(loop.margins() for loop in loops),
                 noise=noise,
-                note=f"on: Q {quality:g}{raised}; {_spared(taps.shape[1], bending)}",
+                note=f"on: Q {quality:g}{raised}; {f'{taps.shape[1]} ' if bending else ''}{spared}",
             )
         complaint = complaints[-1]
         raised = f" (at Q {quality:g}, with {lag}, {complaint})"
     return _off(len(parts), f"with {lag}, {complaint} even at Q {quality:g}")
-
-
-def _counts(rate: float, bending: BendingMode | None, plain: int) -> list[int]:
-    """Numbers of taps worth trying."""
-    if bending is None or not any(bending.coupling):
-        return [plain if bending is None else TAPS + 2]
-    return sorted({min(max(TAPS + 2, 1 + round(span * rate / bending.frequency)), MOST_TAPS) for span in REACHES})
 
 
 def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> str:
@@ -290,15 +281,6 @@ def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode 
     return ""
 
 
-def _spared(count: int, bending: BendingMode | None) -> str:
-    """Say how the taps spare the bending mode."""
-    if bending is None:
-        return "no bending mode is known"
-    known = "measured" if bending.measured else "estimated"
-    return f"{count} taps spare the bending mode {known} at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
-
-
 def _off(coordinates: int, reason: str) -> Damping:
-    """No damper."""
     taps, none = np.zeros((coordinates, TAPS)), np.zeros(coordinates)
     return Damping(taps=taps, added_damping=none, quality=math.inf, margins=(), noise=(), note=f"off: {reason}")

@@ -9,8 +9,6 @@ References
 Grigorii, Li, Peshkin and Colgate, IEEE Transactions on Haptics, 2021, eqs. 1-5.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from math import pi, sqrt

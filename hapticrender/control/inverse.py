@@ -1,7 +1,5 @@
 """Design of the waveform law: filters, prior knowledge of fingers, and the settings of `inverse_kernel`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from functools import lru_cache

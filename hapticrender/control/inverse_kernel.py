@@ -15,8 +15,6 @@ finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner 
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 
-from __future__ import annotations
-
 from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, contact_lag, track_finger, update_targets
@@ -43,7 +41,7 @@ from hapticrender.control.inverse_records import (
 )
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.laws import contact_damping
-from hapticrender.control.limiter import NONFINITE, SATURATED, drive_of, shape_noise
+from hapticrender.control.peak_limit import NONFINITE, SATURATED, drive_of, shape_noise
 from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, PAST_MASK, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit

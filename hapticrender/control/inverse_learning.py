@@ -4,8 +4,6 @@ Symbols and equations are those of `inverse_kernel`: dev = dev_u - sum_i theta_i
 and dev_u are states of the loaded device G, discretised anew as the estimate moves; a contact resets them.
 """
 
-from __future__ import annotations
-
 from numba import carray
 
 from hapticrender.control.inverse_records import (

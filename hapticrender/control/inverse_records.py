@@ -1,7 +1,5 @@
 """Record of the waveform law: settings and state beside those of the controller, and the order of its parameters."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 

@@ -6,8 +6,6 @@ Over a block the envelopes are held, and the innovations of the sample-by-sample
 force to the next's.  The inner damper needs the next sample and runs with M = 1 only.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import carray
 
@@ -26,7 +24,7 @@ from hapticrender.control.carriers import (
     update_targets,
 )
 from hapticrender.control.laws import apply_law, follow_resonance, update_law
-from hapticrender.control.limiter import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, UNLOCKED, largest_drive, limit_drive
+from hapticrender.control.peak_limit import NEAR_LIMIT, NONFINITE, SENSOR_CLIPPED, UNLOCKED, largest_drive, limit_drive
 from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,

@@ -6,8 +6,6 @@ with D(s) = M s^2 + C s + K + z(s) h h^T, h = [1, p/a] the finger's lever arms a
 leaves over.  An error of the law for changes of Omega rad/s is bounded by m Omega^2/|D|.
 """
 
-from __future__ import annotations
-
 import math
 
 from hapticrender.control.carriers import SLOWEST

@@ -6,8 +6,6 @@ hold are inside; no envelope is averaged.  Assumed: carriers of fixed frequency 
 a frozen finger estimate, a drive inside its limits, no rounding.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,7 +28,7 @@ class DiscretePlant:
     c: Array
 
     @classmethod
-    def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> DiscretePlant:
+    def free(cls, mass: Array, damping: Array, stiffness: Array, rate: float) -> "DiscretePlant":
         """Discretise M q'' + C q' + K q = f (kg, N s/m, N/m) exactly."""
         n = len(mass)
         a, b = zoh(*state_space(mass, damping, stiffness, np.eye(n)), 1.0 / rate)

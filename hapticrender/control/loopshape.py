@@ -5,8 +5,6 @@ drives the plant, which a look-up table or an inverse makes 1 (docs/theory.md, "
 ``T = C/(1 + L C)`` and ``C = T/(1 - L T)``.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -49,7 +47,7 @@ class TransferFunction:
         """Value at complex `s` (rad/s)."""
         return np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
 
-    def __mul__(self, other: TransferFunction) -> TransferFunction:
+    def __mul__(self, other: "TransferFunction") -> "TransferFunction":
         return TransferFunction(
             tuple(np.polymul(self.numerator, other.numerator)), tuple(np.polymul(self.denominator, other.denominator))
         )
@@ -106,21 +104,16 @@ def loop_margins(rational: TransferFunction, delay: float = 0.0) -> Margins:
     def loop(s: Array) -> Any:
         return rational(s) * np.exp(-delay * s)
 
-    frequency = _grid(rational)
+    polynomials = rational.numerator, rational.denominator, np.polyadd(rational.numerator, rational.denominator)
+    corners = np.abs(np.concatenate([np.roots(polynomial) for polynomial in polynomials])) / (2 * np.pi)
+    corners = corners[corners > 1e-9 * corners.max()]  # of the open and the closed loop
+    frequency = np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
     gain = np.abs(rational.frequency_response(frequency))
     if not zero_crossings(np.log(gain)).size:
         raise ValueError(f"the loop gain never crosses 1 (largest {gain.max():.3g}): the loop has no margins")
     if unstable_poles(lambda f: 1 + loop(BESIDE + 2j * np.pi * f), np.append(0.0, frequency)):
         return Margins.unstable()
     return margins_of(lambda f: loop(2j * np.pi * f)[:, None, None], frequency)
-
-
-def _grid(loop: TransferFunction) -> Array:
-    """Frequencies (Hz) from far below to far above every corner of the open and the closed loop."""
-    polynomials = loop.numerator, loop.denominator, np.polyadd(loop.numerator, loop.denominator)
-    corners = np.abs(np.concatenate([np.roots(polynomial) for polynomial in polynomials])) / (2 * np.pi)
-    corners = corners[corners > 1e-9 * corners.max()]
-    return np.geomspace(1e-3 * corners.min(), 1e3 * corners.max(), 20001)
 
 
 def envelope_loop(

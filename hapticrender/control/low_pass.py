@@ -12,8 +12,6 @@ theta_D, delay and hold.  Complex: V = C[shape R - X], or V = shape R + C[-X] of
 F = rho D(jw) V, or rho (D V + D' dV/dt + j dw/dt M V), of the free device; see `laws` for rho.
 """
 
-from __future__ import annotations
-
 import math
 
 from numba import carray
@@ -21,19 +19,8 @@ from numba import carray
 from hapticrender.control.carriers import advance_carriers, update_targets
 from hapticrender.control.kernel import LEAK, analyse_sample, sense_block, update_confidence
 from hapticrender.control.laws import turn_ahead
-from hapticrender.control.limiter import SATURATED, drive_of
-from hapticrender.control.records import (
-    CONTROLLER_T,
-    FIXED,
-    LOCKED,
-    LOW_PASS_T,
-    PAIR_T,
-    SUM,
-    TILE_T,
-    W,
-    Y,
-    samples_of,
-)
+from hapticrender.control.peak_limit import SATURATED, drive_of
+from hapticrender.control.records import CONTROLLER_T, FIXED, LOCKED, LOW_PASS_T, PAIR_T, SUM, TILE_T, W, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, polar, unit
 from hapticrender.vectors import conj, get, imag, magnitude, maximum, pair, put, real, sqrt, square, total, where, zeros

@@ -1,7 +1,5 @@
 """Check the margins of the error observer's law at each level of the gain schedule, and lower its bandwidth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -128,7 +126,6 @@ def checked_settings(
 def _checked(
     model: DeviceModel, frequency: Array, settings: Settings, wavenumber: Array, taps: Array, least: LeastMargins
 ) -> Checked:
-    """Lower the bandwidth; see `checked_settings`."""
     locked = wavenumber[wavenumber > 0.0]
     speeds = _speeds(settings, locked)
     highest = float(frequency.max(initial=settings["highest"] if locked.size else 0.0))
@@ -158,7 +155,6 @@ def _checked(
 
 
 def _scaled(settings: Settings, names: tuple[str, ...], factor: float) -> Settings:
-    """Settings with some of them times `factor`."""
     return {**settings, **{name: factor * settings[name] for name in names}}
 
 

@@ -9,8 +9,6 @@ References
 Astrom and Murray, Feedback Systems, 2nd ed., 2021, chapters 10 and 13.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -43,12 +41,12 @@ class Margins:
     bandwidth: float = math.inf  # Hz: so close to every carrier S stays below 1/sqrt 2; inf where there is no carrier
 
     @classmethod
-    def unstable(cls) -> Margins:
+    def unstable(cls) -> "Margins":
         """Return the margins of a loop with a growing pole."""
         return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
 
     @classmethod
-    def smallest(cls, found: list[Margins]) -> Margins:
+    def smallest(cls, found: list["Margins"]) -> "Margins":
         """Return the smallest of every margin, each for itself."""
         smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
         least = min(found, key=lambda margins: margins.modulus)
@@ -163,6 +161,8 @@ def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | No
     peak = sensitivity(values)
     highest, where = highest_peak(lambda frequency: sensitivity(loop(frequency)), grid, peak)
     delay, phase, gain = borne_errors(grid, values)
+    wide = grid[peak >= math.sqrt(0.5)]
+    widths = [np.abs(wide - carrier).min(initial=np.inf) for carrier in ([] if carriers is None else carriers)]
     return Margins(
         stable=True,
         modulus=1.0 / highest,
@@ -170,7 +170,7 @@ def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | No
         delay=delay,
         phase=phase,
         gain=gain,
-        bandwidth=math.inf if carriers is None else min(_halved_within(grid - carrier, peak) for carrier in carriers),
+        bandwidth=float(min(widths, default=math.inf)),
     )
 
 
@@ -231,8 +231,3 @@ def borne_errors(frequency: Array, loop: Array) -> tuple[float, float, float]:
         more = min(more, factor[factor >= 1].min(initial=np.inf))
         less = max(less, factor[factor < 1].max(initial=0.0))
     return float(delay), float(min(phase, np.pi)), float(min(more, 1 / less if less else np.inf))
-
-
-def _halved_within(offset: Array, peak: Array) -> float:
-    """Smallest |offset| (Hz) at which `peak`, the largest singular value of S there, reaches 1/sqrt 2."""
-    return float(np.abs(offset)[peak >= math.sqrt(0.5)].min(initial=np.inf))

@@ -13,8 +13,6 @@ resonant        one integrator a band and coordinate, no low pass; then D V + D'
 All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -34,13 +32,7 @@ from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, de
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import DiscretePlant
-from hapticrender.control.loopshape import (
-    Bandwidths,
-    TransferFunction,
-    envelope_loop,
-    loop_margins,
-    section,
-)
+from hapticrender.control.loopshape import Bandwidths, TransferFunction, envelope_loop, loop_margins, section
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned

@@ -7,8 +7,6 @@ hypotheses h (13 wirings, each with 13 delays, free and with a finger at either 
 second differences in the second half of the silence after it; its energy is none of the response's.
 """
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -158,7 +156,7 @@ def _compared(
         for name, (sensors, actuators) in WIRINGS.items():
             response = np.einsum("jk,jkns->ns", actuators, parts) @ sensors.T
             for delay in delays:
-                h = _detrended(_late(response, delay))
+                h = _detrended(np.pad(response, ((delay, 0), (0, 0)))[: len(response)])
                 alike, power = float((y * h).sum()), float((h**2).sum())
                 residuals[name, delay, load] = 1.0 - alike / max((energy * power) ** 0.5, 1e-300)
                 scales[name, delay, load] = alike / power
@@ -181,10 +179,6 @@ def _responses(model: DeviceModel, drive: Array, finger: Array | None = None) ->
         states[n] = state
         state = state @ plate.a.T + force
     return np.moveaxis(states @ (np.linalg.inv(model.coordinate_from_sensed) @ plate.c).T, 0, 2)
-
-
-def _late(response: Array, samples: int) -> Array:
-    return np.vstack([np.zeros((samples, response.shape[1])), response])[: len(response)]
 
 
 def _detrended(values: Array) -> Array:

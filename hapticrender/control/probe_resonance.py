@@ -8,8 +8,6 @@ drive and sensor over the last 10 ms.  A mode of damping b, d off its resonance,
 wherever the resonance is.  A finger damps: r may lie between that of the free surface and that of `MOST_LOAD`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -11,8 +11,6 @@ Fields of a coordinate, and of the law between two, are numbered in a tile (``e0
 their own, see `coordinates_of`.  A device of one coordinate leaves the other's at zero.
 """
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 from numba import carray
@@ -65,10 +63,7 @@ TILE_FIELDS = [
 ]
 WORK_FIELDS = _complex("x", "rise", "y", "up")
 """Of a tile and coordinate in a block: an envelope and its rise over the block; the same turned to a group."""
-LOW_PASS_FIELDS = [
-    *_complex("low1", "low2", "law1", "law2", "v", "slope"),
-    *("drive", "lag"),
-]
+LOW_PASS_FIELDS = [*_complex("low1", "low2", "law1", "law2", "v", "slope"), *("drive", "lag")]
 """Of a tile in a coordinate of a method with low passes: states of low pass and loop controller, of which the polar
 law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device."""
 
@@ -118,6 +113,7 @@ load lever contact law_contact law_lever finger_mass finger_damping finger_stiff
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
 gain damping_gain damper_scale dc_fast_on feedback_off
 """.split()
+_ARRAYS = "tiles loops commands setpoints work table phasors samples window gains"
 CONTROLLER = np.dtype(
     [
         ("p", SETTINGS),
@@ -126,21 +122,7 @@ CONTROLLER = np.dtype(
         ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "moving", "stale", "implausible")),
-        *(
-            (name, np.int64)
-            for name in (
-                "tiles_at",
-                "loops_at",
-                "commands_at",
-                "setpoints_at",
-                "work_at",
-                "table_at",
-                "phasors_at",
-                "samples_at",
-                "window_at",
-                "gains_at",
-            )
-        ),
+        *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
 )
 """Settings and state of a controller, and the addresses of its arrays."""

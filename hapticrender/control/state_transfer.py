@@ -5,8 +5,6 @@ device, and its supervisor's memory (tests, heat, a stop), lie in blocks of memo
 one; `transfer` copies them when that one takes over.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,7 +13,7 @@ from numba import carray
 
 from hapticrender.control.carriers import FRESH_TIME
 from hapticrender.control.combined import CombinedController
-from hapticrender.control.gains import GAINS
+from hapticrender.control.gain_faults import GAINS
 from hapticrender.control.inverse import WaveformController
 from hapticrender.control.inverse_records import INVERSE, RING
 from hapticrender.control.records import CONTROLLER

@@ -10,8 +10,6 @@ and one pair of products serves two samples, also of envelopes that rise linearl
 z_d, filled anew for each group, its mean velocity.
 """
 
-from __future__ import annotations
-
 from hapticrender.control.carriers import FASTEST
 from hapticrender.control.records import (
     ANALYSIS,

@@ -3,8 +3,6 @@
 The tests themselves, and their conditions, are in `supervisor_kernel`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -13,7 +11,7 @@ import numpy as np
 
 from hapticrender.control.controller import BankController, padded
 from hapticrender.control.device_model import Demand, DeviceModel
-from hapticrender.control.gains import GAINS, design_gains
+from hapticrender.control.gain_faults import GAINS, design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
 from hapticrender.control.supervisor_kernel import (
     ACTIVE,

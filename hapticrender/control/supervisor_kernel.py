@@ -36,15 +36,13 @@ damper; 8 a limit.  Without them a controller has tests 1 and 2.  Causes have th
 the device's limit of rms drive, where it has one.  `control.supervisor` designs all of it.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.control.gains import MOST, check_gains, start_gains
+from hapticrender.control.gain_faults import MOST, check_gains, start_gains
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, MOST_SENSORS
 from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, step
 from hapticrender.protocols import Flag

@@ -1,17 +1,13 @@
 """A plant with a compiled step: samples, noise and finger in, what is sensed and moved out, alone or in closed loop."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from hapticrender.jit import CFunction, addresses, close_loop, kernel
 from hapticrender.protocols import Array, Controller, Flag, Sensed
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger
 
 POSITION, LOAD, STRENGTH, SPEED = range(4)  # columns of the inputs that every plant gets; a plant may add its own
 SENSOR_CLIPPED, SATURATED = int(Flag.SENSOR_CLIPPED), int(Flag.SATURATED)

@@ -22,7 +22,7 @@ from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.jit import record_of
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
-from hapticrender.plants.gap import VACUUM, gap_record
+from hapticrender.plants.gap_estimator import VACUUM, gap_record
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
 from hapticrender.protocols import Array
 

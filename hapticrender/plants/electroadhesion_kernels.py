@@ -8,8 +8,6 @@ on the contact area.  Over a substep h the current is I cos(theta + w u) plus a 
 The carrier turns a whole number of times in a sample, so every sample starts at theta = 0.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba
@@ -17,7 +15,7 @@ import numpy as np
 
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, step
 from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SATURATED, SENSOR_CLIPPED, SPEED
-from hapticrender.plants.gap import GAP, VACUUM, gap_step
+from hapticrender.plants.gap_estimator import GAP, VACUUM, gap_step
 from hapticrender.plants.sliding_contact import SLIDING, sliding_step
 from hapticrender.protocols import Flag
 

@@ -13,8 +13,6 @@ mode are fitted with the rest, from where a template of a mode explains most of 
 Equation and output error: Pintelon & Schoukens, System Identification, 2nd ed. 2012, sections 9.8 and 9.10.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple

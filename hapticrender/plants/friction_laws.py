@@ -4,8 +4,6 @@ They give mu/mu0 over the amplitude a (m, peak) of the surface, the normal load 
 literature does not agree on one of them (docs/theory.md, "Friction laws").  Inside kernels a law is a record of `LAW`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -9,8 +9,6 @@ friction acts along the plate and does not move it.  Left out are the motion of 
 makes of friction: the match v/F was measured by fingers that slid over a vibrating plate.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numba

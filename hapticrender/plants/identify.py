@@ -7,8 +7,6 @@ A gain error c common to both sensors cannot be separated from a plate that is 1
 damped, since the force is known through the drive alone.  Every control law scales in the same way.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping
@@ -119,7 +117,7 @@ class Identified:
         """Whether the model leaves no more than noise."""
         return self.misfit <= self.misfit_bound
 
-    def shortened(self, samples: int) -> Identified:
+    def shortened(self, samples: int) -> "Identified":
         """Return this for a loop whose delay is so many samples shorter, such as that of a board without the host."""
         delay = self.estimates["delay"]
         return replace(

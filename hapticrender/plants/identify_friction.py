@@ -13,8 +13,6 @@ model leaves (turns of the finger, skin) is not white: its intervals come from t
 periods of the modulation (the cluster-robust covariance of Liang & Zeger 1986).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -27,7 +25,7 @@ from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.fitting import as_real
 from hapticrender.plants.identify import SIGMAS_95, Estimate, play
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.touch.finger import Finger
 

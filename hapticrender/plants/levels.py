@@ -6,8 +6,6 @@ stiffness of the lesser level in heave and rocking, the force D r for the target
 largest of their envelopes, over bands, places and path, relative to the band's target.  Nothing is simulated.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,9 +16,9 @@ from scipy.optimize import nnls
 from hapticrender.bands import Bands
 from hapticrender.defaults import LOWEST_FREQUENCY
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
-from hapticrender.plants.gap import VACUUM
+from hapticrender.plants.gap_estimator import VACUUM
 from hapticrender.plants.plate import PlateParameters, structure
-from hapticrender.plants.surface import SurfaceParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import NONE, FingerMechanics

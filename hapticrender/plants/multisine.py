@@ -3,8 +3,6 @@
 Above them follow lines of equal current in heave, which excite a bending mode.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

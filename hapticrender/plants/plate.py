@@ -5,12 +5,10 @@ the displacement e of the sensors in the first free-free bending mode.  Frequenc
 measured on the free plate, its suspension included, so that the finger alone couples it to heave and rocking.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,10 +21,8 @@ from hapticrender.mathx import state_space, zoh
 from hapticrender.plants.compiled import CompiledPlant, resolution
 from hapticrender.plants.plate_kernels import COLUMNS, FUNCTIONS, NODES, PLATE, plate_step
 from hapticrender.protocols import Array
+from hapticrender.touch.finger import Finger
 from hapticrender.touch.mechanics import NONE, FingerMechanics
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
 
 PLACES = ("centre", "end 1", "end 2")
 SIDES = np.array([[1.0, -1.0], [1.0, 1.0]])  # displacement of sides 1 and 2, and their currents, by heave and rocking

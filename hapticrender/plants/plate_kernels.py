@@ -17,8 +17,6 @@ series of the exponential is summed for the state alone.
 The functions of this file call each other by address: each is compiled once, in 1.4 s; inlined, they take 6.3 s.
 """
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -6,8 +6,6 @@ motion, in either direction.  A step outputs the state at the start of a sample,
 friction and a speed that are constant over the sample, and a friction that changes linearly within it (tribometer).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,15 +1,12 @@
 """An ultrasonic plate: one flexural mode, driven at its resonance, whose amplitude reduces friction.
 
 The finger adds damping and shifts the resonance, both with the cube root of its load; the friction that it leaves is
-that of `surface`.  At level "envelope" the mode is moved down, with the same envelope for the same controller at a
-fraction of the rate (docs/theory.md, "Ultrasonic mode").
+that of `ultrasonic_surface`.  At level "envelope" the mode is moved down, with the same envelope for the same
+controller at a fraction of the rate (docs/theory.md, "Ultrasonic mode").
 """
-
-from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +17,7 @@ from hapticrender.jit import record_of
 from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, resolution
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
 from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger
 
 LEVELS = ("carrier", "envelope")
 NOMINAL_LOAD = 0.5  # N: at which `finger_damping` and `finger_shift` hold
@@ -88,11 +83,11 @@ class UltrasonicParameters(Validated):
                     f"must be within {MOST_SHIFT * self.carrier:g} Hz of a carrier of {self.carrier:g} Hz"
                 )
 
-    def sampled(self, rate: float) -> UltrasonicParameters:
+    def sampled(self, rate: float) -> "UltrasonicParameters":
         """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
         return replace(self, rate=rate, sensor_noise=self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate))
 
-    def transposed(self, frequency: float, rate: float) -> UltrasonicParameters:
+    def transposed(self, frequency: float, rate: float) -> "UltrasonicParameters":
         """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
 
         The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with

@@ -13,8 +13,6 @@ inverse of the friction law; the amplitude's own controller follows it along a s
 a friction by the law itself.
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

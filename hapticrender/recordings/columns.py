@@ -43,7 +43,12 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
     ending, text = path.suffix.lower(), (".csv", ".txt")
     require(ending in (*text, *CONTAINERS), "path", str(path), f"a file that ends in {', '.join((*text, *CONTAINERS))}")
     with path.open("rb"):  # a missing file is the same OSError for every format
-        found: Mapping[str, Any] = _read_text(path) if ending in text else _read_arrays(path, *CONTAINERS[ending])
+        if ending in text:
+            found: Mapping[str, Any] = _read_text(path)
+        else:
+            arrays, what = CONTAINERS[ending]
+            with naming_damage(path, f"damaged, or not {what}"), arrays(path) as opened:
+                found = {name: load() for name, (_, load) in opened.items()}
     columns: dict[str, Array] = {}
     others = []
     for name, values in found.items():
@@ -188,11 +193,6 @@ def _read_text(path: Path) -> dict[str, Array]:
                 raise ValueError(f"{path}, line {at}, column {name}: {show(field)}: {bound}")
             values.append(value)
     return dict(zip(names, np.array(values).reshape(-1, len(names)).T, strict=True))
-
-
-def _read_arrays(path: Path, arrays: Callable[[Path], Any], what: str) -> dict[str, Any]:
-    with naming_damage(path, f"damaged, or not {what}"), arrays(path) as found:
-        return {name: load() for name, (_, load) in found.items()}
 
 
 def _separator(lines: Sequence[str]) -> str | None:

@@ -9,7 +9,7 @@ from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, FADE_IN, RUNAWAY, Envelopes, amplitude_error, judged_from
 from hapticrender.recordings.recording import Recording
-from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, MATTERS, UNPLAYABLE, WINDOW
+from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, WINDOW
 
 READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
@@ -18,6 +18,8 @@ SETTLED_SHARE = 0.1  # of the judged time where that is shorter: inside for so l
 INFERRED = "the friction is inferred by a law that is assumed, not measured"
 HARDLY = 2.0  # times what the sensors' noise alone reads: a smaller figure is not distinct from it
 IN_BAND = f"{BAND[0]:g} to {BAND[1]:g} Hz"
+MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN  # a sample with one of these fails
+UNPLAYABLE = 0.01  # share of the reference's energy outside the band from which it is noted
 UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": None, "band": "any", "place": "any"}
 
 

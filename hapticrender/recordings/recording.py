@@ -162,7 +162,6 @@ class Recorder:
         return frames
 
     def _write(self, data: Any) -> BinaryIO:
-        """Hand data to the operating system, behind the header."""
         if self._file is None:
             self.begin()
         file: Any = self._file

@@ -38,12 +38,10 @@ EDGE = 2.0 ** (1 / 6)
 CURVE = "classic"  # detection threshold; the rounding of a 12-bit converter alone is 1.4 times the safe one at 200 Hz
 SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is known
 LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
-UNPLAYABLE = 0.01  # share of the reference's energy outside B from which it is noted
 LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
 LANDING = 3e-3  # s: five memory lengths of a contact at 20 mm/s, in which the friction of a touch builds up
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
-MATTERS = Flag.SATURATED | Flag.NONFINITE | Flag.SENSOR_CLIPPED | Flag.OVERRUN
 
 
 @np.errstate(**DIVERGING)
@@ -84,7 +82,8 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
         columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
         alike = float(weights @ power[:, i] / (weights @ power[:, 0]))
         whole_error = math.sqrt(max(alike, total[i] / total[0]))
-        errors = {"waveform_error": whole_error, "window_error": _windows(power[:, [0, i]])}
+        each = power[:, i] / np.maximum(power[:, 0], QUIET**2 * power[:, 0].mean())  # of quiet windows that loud
+        errors = {"waveform_error": whole_error, "window_error": float(np.sqrt(np.percentile(each, WORST_WINDOWS)))}
         thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, rms, i - 1), share)
         found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))
@@ -182,13 +181,6 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
         power += scale * np.abs(np.hstack([turned, turned[:, 1:] + shares / scales * turned[:, :1]])) ** 2
         cross += scale * turned[:, 0].conj() * turned[:, 1]
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
-
-
-def _windows(power: Array) -> float:
-    """95th percentile of ``rms_B(e)/max(rms_B(r), 0.1 of that of the whole play)`` in windows of 100 ms."""
-    reference, error = power.T
-    each = error / np.maximum(reference, QUIET**2 * reference.mean())
-    return float(np.sqrt(np.percentile(each, WORST_WINDOWS)))
 
 
 def _thirds(

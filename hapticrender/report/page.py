@@ -89,7 +89,6 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def _overview(scenes: Sequence[Outputs]) -> str:
-    """Table of all scenes, a row each, with a link to its section."""
     head, *rows = overview([scene.summary for scene in scenes])
     body = [
         html_row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], f"wide {CLASSES[kind]}")

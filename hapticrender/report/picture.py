@@ -76,7 +76,6 @@ def drawn(unit: str) -> tuple[float, str]:
 
 
 def _head(axes: Any, summary: dict[str, Any], touched: bool) -> None:
-    """Name of the scene, how it was made, and the verdict as a sentence."""
     axes.axis("off")
     axes.set(xlim=(0, 1), ylim=(0, 1))
     finger = "" if touched else " · no finger"
@@ -224,7 +223,6 @@ def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> N
 
 
 def _finger(upper: Any, lower: Any, recording: Recording) -> None:
-    """Draw position and load of the finger; a lifted finger is a gap."""
     time, low, high = outline(recording, "position")
     upper.plot(time, 1e3 * (low + high) / 2, color=INK, lw=1.3)
     upper.set(title="Finger", ylabel="position (mm)")

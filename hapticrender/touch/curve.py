@@ -12,7 +12,7 @@ import numpy as np
 from hapticrender import checks
 from hapticrender.protocols import Array
 
-ROLL_OFF = 1.5  # the passband falls to zero within this factor of its edges
+ROLL_OFF = 1.5  # the passband falls to zero, by half a cosine, within this factor of its edges
 POINTS = 32  # of the table in the shortest period that it holds
 MOST_WINDOW = 1 << 23  # samples of a Welch window
 FAINTEST = 1e-4  # a peak below this share of the strongest one's power is no carrier
@@ -49,7 +49,10 @@ class Curve:
         count = values.size - 1
         length = count * step
         spectrum = dct(values, type=1)
-        spectrum *= _passband(np.arange(count + 1) / (2 * length), low, high)
+        frequency = np.arange(count + 1) / (2 * length)
+        rising = np.clip((frequency * ROLL_OFF / low - 1) / (ROLL_OFF - 1), 0, 1)
+        falling = np.clip((ROLL_OFF - frequency / high) / (ROLL_OFF - 1), 0, 1)
+        spectrum *= np.sin(np.pi / 2 * rising) ** 2 * np.sin(np.pi / 2 * falling) ** 2
         spectrum[-1] /= 2  # the last term of a DCT-I stands alone, the others for a pair
         fine = cls.size(values.size, step, high)
         padded = np.zeros(fine + 1)
@@ -125,13 +128,6 @@ def _spectrum(values: Array, rate: float, resolution: float) -> tuple[Array, Arr
     checks.require(size <= MOST_WINDOW, "spacing", 16 * resolution, least)
     window = np.hanning(min(size, values.size) + 2)[1:-1]
     return welch(values, rate, window, nfft=size, detrend=False)  # type: ignore[no-any-return]
-
-
-def _passband(frequency: Array, low: float, high: float) -> Array:
-    """Gain: 1 from `low` to `high`, half a cosine down to 0 a factor `ROLL_OFF` away."""
-    rising = np.clip((frequency * ROLL_OFF / low - 1) / (ROLL_OFF - 1), 0, 1)
-    falling = np.clip((ROLL_OFF - frequency / high) / (ROLL_OFF - 1), 0, 1)
-    return np.sin(np.pi / 2 * rising) ** 2 * np.sin(np.pi / 2 * falling) ** 2
 
 
 def _refined(frequency: Array, power: Array, index: int) -> float:

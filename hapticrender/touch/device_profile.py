@@ -10,7 +10,7 @@ from typing import Any, Self
 from hapticrender import checks
 from hapticrender.checks import Validated, checked, mapping, parameter
 from hapticrender.errors import naming
-from hapticrender.touch import toml
+from hapticrender.touch import toml_text
 
 ENDING = ".toml"  # of a device's name that is a file
 HEAD = ("kind", "name", "measured_by", "measured_with", "measured_on", "probe")  # the table [profile] of a file
@@ -104,7 +104,7 @@ class DeviceProfile(Validated):
         A `SceneError` states in one line file, key, value, bound and unit.
         """
         with naming(path):
-            found = cls.from_table(toml.loads(toml.read_text(path)))
+            found = cls.from_table(toml_text.loads(toml_text.read_text(path)))
         return found if found.name else cls(**{**vars(found), "name": Path(path).stem})
 
     @classmethod
@@ -127,7 +127,7 @@ class DeviceProfile(Validated):
         head = {key: getattr(self, key) for key in HEAD if getattr(self, key) not in ("", None, True)}
         tables = {"profile": head, "device": self.device, "uncertainty": self.uncertainty}
         tables |= {"calibration": table_of(self.calibration), "limits": table_of(self.limits)}
-        return toml.dumps({key: table for key, table in tables.items() if table}).lstrip("\n")
+        return toml_text.dumps({key: table for key, table in tables.items() if table}).lstrip("\n")
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the profile."""

@@ -96,7 +96,6 @@ HEAVY_SECOND = FingerMechanics(order=2, mass=4e-3, damping=1.5, stiffness=300.0,
 
 
 def _fourth(whole: FingerMechanics, mass: float, damping: float, stiffness: float) -> FingerMechanics:
-    """Skin in series with a phalanx that has the numbers of the whole finger."""
     phalanx = {f"phalanx_{key}": getattr(whole, key) for key in PARTS[:3]}
     return replace(whole, order=4, mass=mass, damping=damping, stiffness=stiffness, **phalanx)
 

@@ -15,7 +15,7 @@ from hapticrender import checks, defaults
 from hapticrender.checks import Validated, checked, mapping, parameter
 from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Texture
-from hapticrender.touch import toml
+from hapticrender.touch import toml_text
 from hapticrender.touch.composed import Chirp, Playlist, Sum
 from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
@@ -202,7 +202,7 @@ class Scene(Validated):
         A `SceneError` states in one line file, key, value, bound and unit.
         """
         with naming(path):
-            text = toml.read_text(path)
+            text = toml_text.read_text(path)
         return cls.from_toml_text(text, str(path), folder=Path(path).parent, name=Path(path).stem)
 
     @classmethod
@@ -211,7 +211,7 @@ class Scene(Validated):
     ) -> "Scene":
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         with naming(where):
-            scene = _read_scene(toml.loads(text), Path(folder), name)
+            scene = _read_scene(toml_text.loads(text), Path(folder), name)
             for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
                 if hasattr(part, "check"):
                     with checks.inside(key):
@@ -229,7 +229,7 @@ class Scene(Validated):
             del tables["device"]["source"]
         tables = {table: values for table, values in tables.items() if values}
         parts = {"texture": _write_texture(self.texture), "finger": _write_finger(self.finger)}
-        return toml.dumps({"name": self.name, "duration": self.duration} | parts | tables)
+        return toml_text.dumps({"name": self.name, "duration": self.duration} | parts | tables)
 
 
 def scene_keys(table: str) -> set[str]:

@@ -12,8 +12,6 @@ Willsky and Jones, IEEE Transactions on Automatic Control 21, 1976 (generalized 
 Anderson, International Journal of Control 28, 1978 (the Riccati equation by doubling).
 """
 
-from __future__ import annotations
-
 import math
 
 import numba

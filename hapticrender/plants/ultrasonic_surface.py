@@ -4,12 +4,10 @@ Levels: "carrier" simulates the mode where it is; "envelope" moves it down to a 
 the same amplitude loop on a fraction of the samples.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,9 +23,7 @@ from hapticrender.plants.sliding_contact import SlidingParameters, sliding_recor
 from hapticrender.plants.ultrasonic import LEVELS, UltrasonicParameters, mode_inputs, mode_record
 from hapticrender.plants.ultrasonic_kernels import AMPLITUDE, SURFACE, surface_step
 from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger
 
 MOST_INNER_DELAY = 8  # samples: with a longer delay there is no inner loop
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase

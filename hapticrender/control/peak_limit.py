@@ -1,7 +1,5 @@
 """Compiled end of every controller: the drive inside its limits."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
