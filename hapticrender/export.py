@@ -39,7 +39,7 @@ invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole 
 ring_pole lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound drive_limit heat_pole
 heat_gain slow_pole fade_out fade_now mass damping stiffness bound noise ringing
 """.split()
-_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
+_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _GAINS = """
 scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
 """.split()

@@ -5,6 +5,7 @@
 
 #define ROOT2 REAL(1.4142135623730951)
 #define INVALID_SHARE REAL(0.3)
+#define MOST_KEPT 2u /* samples that are numbers, between two that are not */
 #define REPEAT_FACTOR 5u /* times the longest repetition before: converters may hold their values */
 #define BY_DRIVE REAL(6.0) /* energy of the residual over that of the force: in a fault the residual is the drive */
 #define POWER REAL(0.6)
@@ -47,12 +48,25 @@ static uint32_t is_frozen(supervisor_t *s, uint32_t i, real_t value, real_t driv
     return ((s->repeats[i] >= least_time) && (s->most[i] - s->least[i] > s->p->frozen_drive)) ? 1u : 0u;
 }
 
-static supervisor_cause_t cause_of(supervisor_t *s, uint32_t invalid, uint32_t frozen, uint32_t beyond)
+/* Whether samples have been no numbers for too long, with at most MOST_KEPT between them that are. */
+static uint32_t is_broken(supervisor_t *s, uint32_t lost)
+{
+    if (lost == 0u) {
+        s->kept += 1u;
+        return 0u;
+    }
+    s->broken = ((s->kept <= MOST_KEPT) ? (s->broken + s->kept) : 0u) + 1u;
+    s->kept = 0u;
+    return (s->broken >= s->p->invalid_time) ? 1u : 0u;
+}
+
+static supervisor_cause_t cause_of(
+    supervisor_t *s, uint32_t invalid, uint32_t frozen, uint32_t beyond, uint32_t broken)
 {
     supervisor_cause_t cause = SUPERVISOR_FINE;
     uint32_t sensors = 0u;
     s->invalid += s->p->invalid_pole * (((invalid != 0u) ? REAL(1.0) : REAL(0.0)) - s->invalid);
-    if ((invalid != 0u) && (s->invalid > INVALID_SHARE)) {
+    if ((broken != 0u) || ((invalid != 0u) && (s->invalid > INVALID_SHARE))) {
         cause = SUPERVISOR_INVALID;
         sensors = invalid;
     } else if (frozen != 0u) {
@@ -79,12 +93,14 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
     uint32_t invalid = 0u;
     uint32_t frozen = 0u;
     uint32_t beyond = 0u;
+    uint32_t lost = 0u;
     s->input[0] = REAL(0.0);
     s->input[1] = REAL(0.0);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         const real_t size = real_abs(sensed[i]);
         if (!(size < d->sensor_limit)) { /* NaN included */
             invalid |= 1u << i;
+            lost |= isfinite(sensed[i]) ? 0u : 1u;
         } else if (is_frozen(s, i, sensed[i], drive) != 0u) {
             frozen |= 1u << i;
         } else {
@@ -96,7 +112,7 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
         s->input[0] += d->coordinate_from_sensor[0][i] * s->last[i];
         s->input[1] += d->coordinate_from_sensor[1][i] * s->last[i];
     }
-    return cause_of(s, invalid, frozen, beyond);
+    return cause_of(s, invalid, frozen, beyond, is_broken(s, lost));
 }
 
 /* Filter coordinates and forces; the state-variable low-pass gives a signal and its derivatives at once. */

@@ -32,8 +32,8 @@ typedef struct {
     real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
     real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
     real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_now;
-    uint32_t frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time, ring_stop_time;
-    uint32_t suspension_time, beyond_time, slow_time;
+    uint32_t invalid_time, frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time;
+    uint32_t ring_stop_time, suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */
     uint32_t damped;    /* 1: the inner damper is watched */
     uint32_t limited;   /* 1: the law's drive limit follows the heat */
@@ -69,6 +69,7 @@ typedef struct {
     real_t sensed_bound;             /* m: that of the settings, or a lower one */
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
+    uint32_t kept, broken; /* samples; see is_broken */
     uint32_t beyond_count, suspended, at, started;
     uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or wrong one; actuator */
     supervisor_cause_t cause;

@@ -9,6 +9,7 @@ one-pole means of squares.
 no  cause        condition                                                                        for
 === ============ ================================================================================ ====================
 1   invalid      share of samples that are not finite or not inside the range > 0.3               20 ms (mean)
+                 or every second or third at least is no number                                   7.1 ms
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves; or the device's last block of samples,
                  for as many samples, and 2 ms, while the drive does not repeat itself            at once
@@ -55,6 +56,7 @@ EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
+MOST_KEPT = 2  # samples that are numbers, between two that are not
 REPEAT_FACTOR = 5  # times the longest repetition before: converters may hold their values
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER = 0.6
@@ -67,7 +69,7 @@ ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion
 sensed_bound drive_limit heat_pole heat_gain slow_pole
 fade_out fade_now
 """.split()
-_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
+_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
@@ -101,6 +103,7 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most", "least_change", "most_change")),
         *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest", "frame_repeats")),
         *((f"{name}_count", np.int64) for name in COUNTS),
+        *((name, np.int64) for name in ("kept", "broken")),  # samples; see `is_broken`
         *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
         ("compared", np.int64),  # whether motion and drive were compared in the last sample
     ]
@@ -129,19 +132,35 @@ def repeats_frame(supervisor, i, value, drive):
 
 
 @kernel
+def is_broken(supervisor, lost):
+    """Whether samples have been no numbers for too long, with at most `MOST_KEPT` between them that are.
+
+    `kept` of the state counts samples since the last one that was `lost`, `broken` those since the first of such.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    if not lost:
+        s.kept += 1
+        return False
+    s.broken = (s.broken + s.kept if s.kept <= MOST_KEPT else 0) + 1
+    s.kept = 0
+    return s.broken >= s.p.invalid_time
+
+
+@kernel
 def check_sensors(supervisor, sensed, n, drive, acts):
     """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
 
     A drive that does not act (on a surface without a sliding finger) moves no sensor.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, cause, invalid, frozen, beyond = s.p, 0, 0, 0, 0
+    p, cause, invalid, frozen, beyond, lost = s.p, 0, 0, 0, 0, False
     last, repeats, longest, least, most, shows = s.last, s.repeats, s.longest, s.least, s.most, p.coordinate_from_sensor
     q0 = q1 = 0.0
     for i in range(p.sensors):
         value = sensed[n * p.sensors + i]
         if not abs(value) < p.sensor_limit:
             invalid |= 1 << i
+            lost |= not math.isfinite(value)
         elif value == last[i] and acts:
             repeats[i] += 1
             least[i], most[i] = min(least[i], drive), max(most[i], drive)
@@ -159,7 +178,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         q1 += shows[1, i] * last[i]
     s.input[0], s.input[1] = q0, q1
     s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
-    if invalid > 0 and s.invalid > INVALID_SHARE:
+    if is_broken(supervisor, lost) or (invalid > 0 and s.invalid > INVALID_SHARE):
         cause = INVALID
     elif frozen > 0:
         cause = FROZEN
