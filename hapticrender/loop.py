@@ -346,8 +346,9 @@ class _Loop:
         if position is None:
             position = self.rendering.scene.finger.position(self._time(driver.block))
         sensed = sensed._replace(position=position)
-        if sensed.flags is not None and hasattr(driver, "host_delay") and hasattr(self.controller, "unplayed"):
-            device_delay = self.rendering.model.delay - driver.host_delay
+        device: Any = self.rendering.device
+        if sensed.flags is not None and hasattr(device, "host_delay") and hasattr(self.controller, "unplayed"):
+            device_delay = self.rendering.model.delay - device.host_delay
             self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
         self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
         return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
