@@ -101,7 +101,7 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
-        ("tilt", np.float64, (2, 3)),  # low-pass twice and slow mean of the unexplained moment, and of twice the drive's
+        ("tilt", np.float64, (2, 3)),  # low-pass, twice, and slow mean: of the moment left, of twice the drive
         ("tilt_energy", np.float64, (3,)),  # of the one, of both, of the other
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
