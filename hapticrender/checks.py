@@ -88,6 +88,7 @@ def numbers(
     bound = f"a list of {size} finite numbers >= {least:g} and <= {most:g} {unit}".strip()
     if isinstance(value, np.ndarray):
         require(value.ndim == 1 and value.dtype.kind in "iuf", key, value, bound, TypeError)
+        require(not np.ma.is_masked(value), key, value, f"{bound}, none of them masked: fill them")
     else:
         require(isinstance(value, list | tuple) and all(map(_is_number, value)), key, value, bound, TypeError)
     require(1 <= len(value) <= LONGEST_LIST and count in (None, len(value)), key, value, bound)

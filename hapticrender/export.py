@@ -21,7 +21,7 @@ CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
 BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES, PAST_BYTES = 12_576, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
+OTHER_BYTES, PAST_BYTES = 12_624, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
@@ -37,9 +37,9 @@ prior_covariance
 _SUPERVISION = """
 invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole ring_corner ring_top_gain
 ring_pole lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound drive_limit heat_pole
-heat_gain slow_pole fade_out fade_now mass damping stiffness bound noise ringing
+heat_gain slow_pole fade_out fade_now tilt_low tilt_high tilt_pole mass damping stiffness bound noise ringing
 """.split()
-_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
+_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _GAINS = """
 scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
 """.split()

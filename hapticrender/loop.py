@@ -125,17 +125,25 @@ def render(
     return run(rendering, journal=journal, progress=progress)
 
 
-def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
-    """Play a prepared rendering to its end; see `render`.
+def run(
+    rendering: Rendering,
+    *,
+    journal: str | Path | None = None,
+    progress: Progress | None = None,
+    begin: Callable[[], object] = lambda: None,
+) -> Recording:
+    """Play a prepared rendering to its end; see `render`.  `begin` is called before the first sample is recorded.
 
     However it ends (an error, a signal as docs/safety.md says), every sample played is recorded and the device is left
     at zero drive.
     """
     driver, total = rendering.driver, rendering.samples
-    recorder = recorder_of(rendering, journal, requested=rendering.requested)
+    recorder, begins = recorder_of(rendering, journal, requested=rendering.requested), ExitStack()
+    begins.callback(begin)  # once
 
     def keep(signals: dict[str, Any]) -> None:
         if len(signals["flags"]):
+            begins.close()
             recorder.append(**signals)
 
     device = rendering.device
@@ -344,8 +352,9 @@ class _Loop:
         if position is None:
             position = self.rendering.scene.finger.position(self._time(driver.block))
         sensed = sensed._replace(position=position)
-        if sensed.flags is not None and hasattr(driver, "host_delay") and hasattr(self.controller, "unplayed"):
-            device_delay = self.rendering.model.delay - driver.host_delay
+        device: Any = self.rendering.device
+        if sensed.flags is not None and hasattr(device, "host_delay") and hasattr(self.controller, "unplayed"):
+            device_delay = self.rendering.model.delay - device.host_delay
             self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
         self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
         return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed

@@ -167,6 +167,42 @@ def test_a_fault_of_a_part_stops_the_whole_device_at_the_time_it_is_said_to():
     assert not log["drive"][first + round(0.002 * RATE) + 1 :].any()
 
 
+class LateHost:
+    """A hybrid whose host computes drive two blocks ahead; blocks with which it is late are zeros, and flagged."""
+
+    rate, block, delay, host_delay = float(RATE), 4, 12, 8
+    drive_channels = sensed_channels = 3
+    probe = False
+
+    def __init__(self, late, gains):
+        self.plant, self.late, self.number, self.queue = bench().plant, late, -1, [np.zeros((4, 3))] * 2
+        self.gains = gains
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exc):
+        pass
+
+    def play(self, drive):
+        self.number += 1
+        self.queue.append(0.0 * drive if self.number + 2 in self.late else drive)
+        sensed = self.plant.run(self.queue.pop(0)).sensed * self.gains
+        flags = np.full(4, int(hr.Flag.OVERRUN) if self.number in self.late else 0)
+        return Sensed(sensed, flags=flags)
+
+
+@pytest.mark.parametrize("frequency", [40.0, 60.0])
+def test_a_host_that_is_late_is_not_taken_for_a_fault_of_the_plate(frequency):
+    """For 51 ms of every 120, from the first block on; a plate that is inverted is stopped."""
+    late = {number for number in range(1250) if 1 <= number % 300 <= 128}
+    texture = tone(frequency, 0.01)
+    recording = hr.render(scene(texture, duration=0.5), driver=LateHost(late, (1.0, 1.0, 1.0)))
+    assert np.count_nonzero(recording.flags & hr.Flag.OVERRUN) == 4 * len(late)
+    with pytest.raises(hr.DeviceFault, match=r"samples until then were lost, .*; found was: "):
+        hr.render(scene(texture, duration=0.5), driver=LateHost(late, (-1.0, -1.0, 1.0)))
+
+
 @pytest.mark.parametrize("screen_levels", [{}, {"level": "carrier", "sensor": "impedance"}], ids=["force", "gap"])
 def test_plate_and_screen_are_those_of_their_own(screen_levels):
     """Sensed, flags and motion are those of plate and screen alone, sample for sample, in blocks or not."""

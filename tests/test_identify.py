@@ -240,6 +240,13 @@ def test_a_delay_that_the_driver_does_not_state_is_found():
         compare(identified, PAPER)
 
 
+def test_a_delay_longer_than_the_wait_is_found():
+    """Of a sound card in blocks of 4096: 0.34 s; the record would begin before the plate moves."""
+    identified = identify(StrangersPlate(rate=48e3, block=4096, told=16_384, delay=12_289), PAPER)
+    assert identified.estimates["delay"].value == pytest.approx(16_384, abs=0.1)
+    assert identified.parameters.mass == pytest.approx(0.032, rel=1e-3)
+
+
 def test_a_finger_is_refused_by_its_load_or_by_its_motion():
     with pytest.raises(hr.DesignError, match=r"static load = 0\.(19|2)\d* N: must be within \+-0.05 N; remove"):
         found(load=0.2, position=27.5e-3)

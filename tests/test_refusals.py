@@ -171,6 +171,7 @@ TEXTURES = [
     (lambda: carriers(wavenumber=[0.0]), r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
     (lambda: carriers(envelope=[np.nan, 0.0]), r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
     (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0, 1.0]), "rate is missing"),
+    (lambda: hr.Recorded(amplitude=1e-6, rate=9.0, samples=np.ma.masked_greater(np.arange(4.0), 2)), "masked: fill"),
     (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0], rate=100.0), "samples = .*: must be >= 2 numbers"),
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", rate=100.0), "rate = 100.0: must be left out, as the file has"),
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", **WHITE), "file, samples: exactly one must be given"),

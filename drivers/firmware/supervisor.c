@@ -5,12 +5,17 @@
 
 #define ROOT2 REAL(1.4142135623730951)
 #define INVALID_SHARE REAL(0.3)
+#define MOST_KEPT 2u /* samples that are numbers, between two that are not */
 #define REPEAT_FACTOR 5u /* times the longest repetition before: converters may hold their values */
 #define BY_DRIVE REAL(6.0) /* energy of the residual over that of the force: in a fault the residual is the drive */
 #define POWER REAL(0.6)
 #define SLOW_POWER REAL(0.65)
 #define SLOW_FORCE REAL(3.0)
 #define RINGING_STEP REAL(0.4)
+#define LEAST_TILTED REAL(0.85)
+#define MOST_TILTED REAL(1.2)
+#define LEAST_MOMENT REAL(0.1)
+#define UNEXPLAINED_MOMENT REAL(3e-3)
 #define MOTION_SAMPLES 5u
 
 void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *played)
@@ -47,12 +52,25 @@ static uint32_t is_frozen(supervisor_t *s, uint32_t i, real_t value, real_t driv
     return ((s->repeats[i] >= least_time) && (s->most[i] - s->least[i] > s->p->frozen_drive)) ? 1u : 0u;
 }
 
-static supervisor_cause_t cause_of(supervisor_t *s, uint32_t invalid, uint32_t frozen, uint32_t beyond)
+/* Whether samples have been no numbers for too long, with at most MOST_KEPT between them that are. */
+static uint32_t is_broken(supervisor_t *s, uint32_t lost)
+{
+    if (lost == 0u) {
+        s->kept += 1u;
+        return 0u;
+    }
+    s->broken = ((s->kept <= MOST_KEPT) ? (s->broken + s->kept) : 0u) + 1u;
+    s->kept = 0u;
+    return (s->broken >= s->p->invalid_time) ? 1u : 0u;
+}
+
+static supervisor_cause_t cause_of(
+    supervisor_t *s, uint32_t invalid, uint32_t frozen, uint32_t beyond, uint32_t broken)
 {
     supervisor_cause_t cause = SUPERVISOR_FINE;
     uint32_t sensors = 0u;
     s->invalid += s->p->invalid_pole * (((invalid != 0u) ? REAL(1.0) : REAL(0.0)) - s->invalid);
-    if ((invalid != 0u) && (s->invalid > INVALID_SHARE)) {
+    if ((broken != 0u) || ((invalid != 0u) && (s->invalid > INVALID_SHARE))) {
         cause = SUPERVISOR_INVALID;
         sensors = invalid;
     } else if (frozen != 0u) {
@@ -79,12 +97,14 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
     uint32_t invalid = 0u;
     uint32_t frozen = 0u;
     uint32_t beyond = 0u;
+    uint32_t lost = 0u;
     s->input[0] = REAL(0.0);
     s->input[1] = REAL(0.0);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         const real_t size = real_abs(sensed[i]);
         if (!(size < d->sensor_limit)) { /* NaN included */
             invalid |= 1u << i;
+            lost |= isfinite(sensed[i]) ? 0u : 1u;
         } else if (is_frozen(s, i, sensed[i], drive) != 0u) {
             frozen |= 1u << i;
         } else {
@@ -96,7 +116,7 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
         s->input[0] += d->coordinate_from_sensor[0][i] * s->last[i];
         s->input[1] += d->coordinate_from_sensor[1][i] * s->last[i];
     }
-    return cause_of(s, invalid, frozen, beyond);
+    return cause_of(s, invalid, frozen, beyond, is_broken(s, lost));
 }
 
 /* Filter coordinates and forces; the state-variable low-pass gives a signal and its derivatives at once. */
@@ -294,8 +314,34 @@ static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
+/* Test 11, slowly: whether the rocking force leaves a moment of -2 eta times its own, beside that of the finger. */
+static uint32_t check_tilt(supervisor_t *s, real_t position)
+{
+    const supervision_t *p = s->p;
+    const real_t *q = s->input;
+    const real_t place = isnan(position) ? REAL(0.0) : (s->design->lever_per_metre * position);
+    const real_t lever = real_clip(place, -p->lever, p->lever);
+    const real_t load = p->stiffness[0][0] * q[0] + p->stiffness[0][1] * q[1] - s->force[0];
+    const real_t moment = p->stiffness[1][0] * q[0] + p->stiffness[1][1] * q[1] - s->force[1] - lever * load;
+    for (uint32_t i = 0u; i < 2u; i++) {
+        mean(&s->tilt[i][0], p->tilt_low, (i == 0u) ? moment : (REAL(2.0) * s->force[1]));
+        mean(&s->tilt[i][1], p->tilt_low, s->tilt[i][0]);
+        mean(&s->tilt[i][2], p->tilt_high, s->tilt[i][1]);
+    }
+    const real_t left = s->tilt[0][1] - s->tilt[0][2];
+    const real_t drive = s->tilt[1][1] - s->tilt[1][2];
+    real_t *e = s->tilt_energy;
+    mean(&e[0], p->tilt_pole, left * left);
+    mean(&e[1], p->tilt_pole, -left * drive);
+    mean(&e[2], p->tilt_pole, drive * drive);
+    if (!(e[2] > LEAST_MOMENT * LEAST_MOMENT) || !(e[1] > LEAST_TILTED * e[2]) || !(e[1] < MOST_TILTED * e[2])) {
+        return 0u;
+    }
+    return (e[0] * e[2] - e[1] * e[1] < UNEXPLAINED_MOMENT * e[0] * e[2]) ? 1u : 0u;
+}
+
 /* Tests 9 to 11: whether a sensor or an actuator has changed its gain, or two are swapped. */
-static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
+static supervisor_cause_t compare_gains(supervisor_t *s, real_t position, supervisor_cause_t cause)
 {
     gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
@@ -304,6 +350,7 @@ static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t caus
             found.swapped = 0u;
         }
     }
+    found.swapped |= check_tilt(s, position);
     if ((cause != SUPERVISOR_FINE) || ((found.sensors | found.swapped | found.actuators) == 0u)) {
         return cause;
     }
@@ -316,7 +363,8 @@ static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t caus
 }
 
 /* All tests of a sample; returns what failed first. */
-static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[])
+static supervisor_cause_t check(
+    supervisor_t *s, law_t *law, const real_t sensed[], real_t position, const real_t drive[])
 {
     supervisor_cause_t cause = check_sensors(s, sensed, s->forces[s->at][2]);
     if ((check_drive(s, drive) != 0u) && (cause == SUPERVISOR_FINE)) {
@@ -341,7 +389,7 @@ static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed
         cause = SUPERVISOR_RINGING;
     }
     if ((s->p->compared != 0u) && (s->cause == SUPERVISOR_FINE)) {
-        cause = compare_gains(s, cause);
+        cause = compare_gains(s, position, cause);
     }
     return cause;
 }
@@ -361,7 +409,7 @@ uint32_t supervisor_step(
         s->input[2u + i] = REAL(0.5) * (s->force[i] + s->forces[s->at][i]);
         s->force[i] = s->forces[s->at][i];
     }
-    const supervisor_cause_t cause = check(s, law, sensed, drive);
+    const supervisor_cause_t cause = check(s, law, sensed, position, drive);
     s->cause = (s->cause == SUPERVISOR_FINE) ? cause : s->cause;
     if (s->cause != SUPERVISOR_FINE) {
         s->fade_step = real_max(s->fade_step, (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : s->p->fade_out);

@@ -32,8 +32,9 @@ typedef struct {
     real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
     real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
     real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_now;
-    uint32_t frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time, ring_stop_time;
-    uint32_t suspension_time, beyond_time, slow_time;
+    real_t tilt_low, tilt_high, tilt_pole;
+    uint32_t invalid_time, frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time;
+    uint32_t ring_stop_time, suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */
     uint32_t damped;    /* 1: the inner damper is watched */
     uint32_t limited;   /* 1: the law's drive limit follows the heat */
@@ -62,13 +63,14 @@ typedef struct {
     real_t forces[LAW_DELAY + 1][3]; /* N, N, A: forces and sum of the drive on their way */
     real_t force[2], input[4];
     real_t energy[12];               /* means of squares of q, v, a, dF, F, r in both coordinates */
-    real_t power[2], ring_energy[2], slow[4];
+    real_t power[2], ring_energy[2], slow[4], tilt[2][3], tilt_energy[3];
     real_t drive_energy[LAW_CHANNELS], heat[LAW_CHANNELS];
     real_t last[LAW_SENSORS], least[LAW_SENSORS], most[LAW_SENSORS];
     real_t fade, fade_step, invalid, peak;
     real_t sensed_bound;             /* m: that of the settings, or a lower one */
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
+    uint32_t kept, broken; /* samples; see is_broken */
     uint32_t beyond_count, suspended, at, started;
     uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or wrong one; actuator */
     supervisor_cause_t cause;

@@ -169,6 +169,12 @@ class CombinedController(Addressed):
         found = (part.fault for part in parts if isinstance(part, SupervisedController))
         return next((fault for fault in found if fault is not None), None)
 
+    def unplayed(self, samples: Array) -> None:
+        """Compare motion with no drive where that of both parts was not played; see `SupervisedController`."""
+        for part in self.parts:
+            if isinstance(part, SupervisedController):
+                part.unplayed(samples)
+
     run = BankController.run
 
 

@@ -21,6 +21,7 @@ from hapticrender.control.supervisor_kernel import (
     FROZEN,
     INCONSISTENT,
     INVALID,
+    INVALID_SHARE,
     OVERMOTION,
     RINGING,
     ROOT2,
@@ -48,6 +49,7 @@ RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
+TILT_TIMES = 10e-3, 0.1, 60e-3  # s: low-pass, high-pass, mean; about the 50 ms in which a device is levelled
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
@@ -235,6 +237,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "coordinate_from_sensor": padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
         "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         "invalid_pole": _pole(INVALID_TIME, rate),
+        "invalid_time": math.ceil(-INVALID_TIME * math.log1p(-INVALID_SHARE) * rate),
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
         "fade_out": min(model.pace / (FADE_OUT * rate), 1.0),
@@ -312,6 +315,8 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "most_motion": 3.0 * demand.motion + 5.4 * sag,
         "slow_pole": _pole(SLOW_MEAN, rate),
         "slow_time": SLOW_TIME * rate,
+        **{f"tilt_{name}": _pole(t, rate) for name, t in zip(("low", "high", "pole"), TILT_TIMES, strict=True)},
+        "lever_per_metre": model.lever_per_metre,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
 

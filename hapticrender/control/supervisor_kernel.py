@@ -9,6 +9,7 @@ one-pole means of squares.
 no  cause        condition                                                                        for
 === ============ ================================================================================ ====================
 1   invalid      share of samples that are not finite or not inside the range > 0.3               20 ms (mean)
+                 or every second or third at least is no number                                   7.1 ms
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves; or the device's last block of samples,
                  for as many samples, and 2 ms, while the drive does not repeat itself            at once
@@ -24,6 +25,7 @@ no  cause        condition                                                      
 10  actuator ... its gain: an actuator gives -1.6 to -0.4 times its force; see `gains`            5 ms and more
 11  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
                  see `gains`                                                                      5 ms and more
+                 or the drive tilts the device the wrong way, see `check_tilt`                    60 ms (mean)
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
@@ -53,19 +55,22 @@ EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
 INVALID_SHARE = 0.3
+MOST_KEPT = 2  # samples that are numbers, between two that are not
 REPEAT_FACTOR = 5  # times the longest repetition before: converters may hold their values
 BY_DRIVE = 6.0  # E_r over E_F: in a fault the residual is the drive, in a load step it is not
 POWER = 0.6
 SLOW_POWER, SLOW_FORCE = 0.65, 3.0  # healthy: below 0.03, with a finger negative, while it taps up to 0.8 for a moment
 RINGING_STEP = 0.4
+LEAST_TILTED, MOST_TILTED = 0.85, 1.2  # eta of swapped sensors is (1 + K/K_true)/2 of rocking's stiffness, of coils 1
+LEAST_MOMENT, UNEXPLAINED_MOMENT = 0.1, 3e-3  # N; of its energy: 0.19 and more in 20 minutes of normal scenes
 
 _SETTINGS = """
 sensor_limit invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole
 ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
 sensed_bound drive_limit heat_pole heat_gain slow_pole
-fade_out fade_now
+fade_out fade_now tilt_low tilt_high tilt_pole lever_per_metre
 """.split()
-_TIMES = "frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
+_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
@@ -94,11 +99,14 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
+        ("tilt", np.float64, (2, 3)),  # low-pass, twice, and slow mean: of the moment left, of twice the drive
+        ("tilt_energy", np.float64, (3,)),  # of the one, of both, of the other
         ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most", "least_change", "most_change")),
         *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest", "frame_repeats")),
         *((f"{name}_count", np.int64) for name in COUNTS),
+        *((name, np.int64) for name in ("kept", "broken")),  # samples; see `is_broken`
         *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
         ("compared", np.int64),  # whether motion and drive were compared in the last sample
     ]
@@ -127,19 +135,35 @@ def repeats_frame(supervisor, i, value, drive):
 
 
 @kernel
+def is_broken(supervisor, lost):
+    """Whether samples have been no numbers for too long, with at most `MOST_KEPT` between them that are.
+
+    `kept` of the state counts samples since the last one that was `lost`, `broken` those since the first of such.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    if not lost:
+        s.kept += 1
+        return False
+    s.broken = (s.broken + s.kept if s.kept <= MOST_KEPT else 0) + 1
+    s.kept = 0
+    return s.broken >= s.p.invalid_time
+
+
+@kernel
 def check_sensors(supervisor, sensed, n, drive, acts):
     """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
 
     A drive that does not act (on a surface without a sliding finger) moves no sensor.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, cause, invalid, frozen, beyond = s.p, 0, 0, 0, 0
+    p, cause, invalid, frozen, beyond, lost = s.p, 0, 0, 0, 0, False
     last, repeats, longest, least, most, shows = s.last, s.repeats, s.longest, s.least, s.most, p.coordinate_from_sensor
     q0 = q1 = 0.0
     for i in range(p.sensors):
         value = sensed[n * p.sensors + i]
         if not abs(value) < p.sensor_limit:
             invalid |= 1 << i
+            lost |= not math.isfinite(value)
         elif value == last[i] and acts:
             repeats[i] += 1
             least[i], most[i] = min(least[i], drive), max(most[i], drive)
@@ -157,7 +181,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         q1 += shows[1, i] * last[i]
     s.input[0], s.input[1] = q0, q1
     s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
-    if invalid > 0 and s.invalid > INVALID_SHARE:
+    if is_broken(supervisor, lost) or (invalid > 0 and s.invalid > INVALID_SHARE):
         cause = INVALID
     elif frozen > 0:
         cause = FROZEN
@@ -243,7 +267,30 @@ def check_motion(supervisor):
 
 
 @kernel
-def compare_gains(supervisor):
+def check_tilt(supervisor, position):
+    """Test 11, slowly: whether changes of the rocking force F leave those of a moment that is -2 eta F.
+
+    Swapped sensors or actuators do; a finger makes the moment of its load at `position`, which is taken off.
+    """
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, q, k, t, e = s.p, s.input, s.p.stiffness, s.tilt, s.tilt_energy
+    lever = min(max(p.lever_per_metre * position, -p.lever), p.lever) if position == position else 0.0
+    load = k[0, 0] * q[0] + k[0, 1] * q[1] - s.force[0]
+    moment = k[1, 0] * q[0] + k[1, 1] * q[1] - s.force[1] - lever * load
+    for i in range(2):
+        t[i, 0] += p.tilt_low * ((moment if i == 0 else 2.0 * s.force[1]) - t[i, 0])
+        t[i, 1] += p.tilt_low * (t[i, 0] - t[i, 1])
+        t[i, 2] += p.tilt_high * (t[i, 1] - t[i, 2])
+    left, drive = t[0, 1] - t[0, 2], t[1, 1] - t[1, 2]
+    e[0] += p.tilt_pole * (left * left - e[0])
+    e[1] += p.tilt_pole * (-left * drive - e[1])
+    e[2] += p.tilt_pole * (drive * drive - e[2])
+    large = e[2] > LEAST_MOMENT * LEAST_MOMENT and LEAST_TILTED * e[2] < e[1] < MOST_TILTED * e[2]
+    return large and e[0] * e[2] - e[1] * e[1] < UNEXPLAINED_MOMENT * e[0] * e[2]
+
+
+@kernel
+def compare_gains(supervisor, position):
     """Tests 9 to 11; returns the cause, and the sensors or actuators, as bits."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, q = s.p, s.input
@@ -255,7 +302,7 @@ def compare_gains(supervisor):
         if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
             sensors &= ~(1 << i)
             swapped = False
-    if swapped:
+    if check_tilt(supervisor, position) or swapped:
         return SWAPPED, EVERY
     if sensors > 0:
         return SENSOR_GAIN, sensors
@@ -348,7 +395,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
         if p.gains != 0 and s.cause == 0:
-            found, which = compare_gains(supervisor)
+            found, which = compare_gains(supervisor, position[n])
             if found > 0 and cause == 0:
                 cause, s.sensors = found, which
         s.compared = 1

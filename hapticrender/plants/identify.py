@@ -48,6 +48,7 @@ from hapticrender.touch.finger import Finger
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
 UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
 RAMP = 0.05  # s: fade-in and fade-out of the drive
+SETTLED = 0.25  # s: least time from the first motion to the record
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
@@ -228,8 +229,8 @@ def identify(
         Expected plate; electronics, geometry, the mean of the sensor gains and the modal mass of a bending mode, which
         only scales its shape at the coils, are taken as given.
     seconds, wait : float, s
-        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s:
-        delays up to wait - 0.05 s are identified.
+        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s,
+        longer where the driver's delay is above 0.05 s: delays up to wait - 0.05 s are identified.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate; less where the driver's `drive_limit` allows less.
     contact : float, N, > 0
@@ -267,6 +268,7 @@ def identify(
         return found.shortened(getattr(made, "host_delay", 0))
     rate = float(driver.rate)
     samples = _samples(driver, parameters, seconds, wait)
+    wait = max(wait, driver.delay / rate + SETTLED)
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
     if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
