@@ -46,7 +46,7 @@ def test_closed_streams_are_no_error(tmp_path, tiny, closed):
     assert {path.name for path in (tmp_path / "out").iterdir()} >= SCENE_FILES
 
 
-@pytest.mark.parametrize("verb", ["validate {}", "validate --suite accuracy modulation", "latency"])
+@pytest.mark.parametrize("verb", ["validate --suite accuracy modulation", "latency"])
 def test_a_driver_may_be_a_module_in_the_current_folder(tmp_path, tiny, verb):
     """With -P, and so in the console script, that folder is no part of Python's path."""
     (tmp_path / "mine.py").write_text("def driver(*_, **__):\n    return {}['it is there']\n")
