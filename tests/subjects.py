@@ -1,4 +1,7 @@
-"""Simulated subjects: a finger of known mechanics touches a plate that is 2 % off its profile, slides and lifts."""
+"""Simulated subjects: a finger of known mechanics touches a plate that is 2 % off its profile, slides and lifts.
+
+And impedances of known truth, made without any recording.
+"""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -8,7 +11,7 @@ import numpy as np
 from strangers_plate import StrangersPlate
 
 import hapticrender as hr
-from hapticrender.analysis.records import LOADED
+from hapticrender.analysis.records import LOADED, Impedance
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND
 
 FREQUENCIES = np.array([20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0])  # Hz, of the paper
@@ -134,3 +137,15 @@ def population(count, seed=1):
     seeds = range(seed, seed + count)
     each = zip(mechanics, loads.tolist(), speeds.tolist(), seeds, strict=True)
     return [Subject(*values) for values in each]
+
+
+def make_impedance(rng, finger, windows, loads, *, noise=0.05, exponent=1 / 3, masked=0.0, frequency=FREQUENCIES):
+    """Windows under loads (N) spread evenly over their logarithm; errors of `noise`/2 to 2 `noise` of |Z|."""
+    load = np.exp(rng.uniform(*np.log(loads), windows))
+    growth = np.exp(exponent * np.log(load / finger.reference_load))
+    truth = finger.impedance(frequency) * growth[:, None]
+    error = noise * np.abs(truth) * 2 ** rng.uniform(-1, 1, truth.shape)
+    value = truth + error * (rng.standard_normal(truth.shape) + 1j * rng.standard_normal(truth.shape))
+    hidden = rng.random(truth.shape) < masked
+    value[hidden], error[hidden] = np.nan, np.nan
+    return Impedance(0.2 * np.arange(windows), np.broadcast_to(frequency, truth.shape), value, error, load, 0 * load)

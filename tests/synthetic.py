@@ -1,49 +1,32 @@
 """Recordings of motions that are known in closed form."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hapticrender.bands import Bands
-from hapticrender.recordings.recording import Recorder, Recording
-from hapticrender.touch.grating import Grating
-from hapticrender.touch.scene import Scene
+import hapticrender as hr
 
 RATE = 5000.0  # Hz
 PLACES = ("centre", "end 1", "end 2")
 
 
-def make_scene(**fields: Any) -> Scene:
-    return Scene(**({"texture": Grating(amplitude=1e-5, frequency=100.0), "duration": 4.0, "name": "known"} | fields))
-
-
-def make_bands(frequency: Any, envelope: Any, wavenumber: Any = 0.0, phase: Any = 0.0, **options: bool) -> Bands:
+def make_bands(frequency, envelope, wavenumber=0.0, phase=0.0, **options):
     frequency, wavenumber, phase = np.broadcast_arrays(np.atleast_1d(frequency).astype(float), wavenumber, phase)
     constant = envelope if envelope is None else np.broadcast_to(np.asarray(envelope, complex), frequency.shape)
-    return Bands(frequency=frequency, wavenumber=wavenumber * 1.0, phase=phase * 1.0, envelope=constant, **options)
+    return hr.Bands(frequency=frequency, wavenumber=wavenumber * 1.0, phase=phase * 1.0, envelope=constant, **options)
 
 
-def make_recorder(path: Path | None, bands: Bands, *, rate: float = RATE, **fields: Any) -> Recorder:
-    scene = make_scene(**fields)
-    return Recorder(path, scene=scene, method="paper", seed=7, rate=rate, bands=bands, drive_limit=3.0)
+def make_recorder(path, bands, *, rate=RATE, **fields):
+    texture = hr.Grating(amplitude=1e-5, frequency=100.0)
+    scene = hr.Scene(**({"texture": texture, "duration": 4.0, "name": "known"} | fields))
+    return hr.Recorder(path, scene=scene, method="paper", seed=7, rate=rate, bands=bands, drive_limit=3.0)
 
 
-def times(duration: float, rate: float = RATE) -> Any:
+def times(duration, rate=RATE):
     return np.arange(round(duration * rate)) / rate
 
 
-def make_signals(
-    bands: Bands,
-    motion_envelope: Any,
-    *,
-    duration: float = 4.0,
-    rate: float = RATE,
-    position: Any = np.nan,
-    target: Any = None,
-    extra: Any = 0.0,
-) -> dict[str, Any]:
+def make_signals(bands, motion_envelope, *, duration=4.0, rate=RATE, position=np.nan, target=None, extra=0.0):
     """Signals whose motion is `extra` (n, places) plus the given envelopes (broadcast to (n, places, n_bands))."""
     time = times(duration, rate)
     n, k = len(time), len(bands)
@@ -64,17 +47,15 @@ def make_signals(
     }
 
 
-def make_recording(
-    bands: Bands, motion_envelope: Any, *, scene: dict[str, Any] | None = None, motion_source: str = "true", **rest: Any
-) -> Recording:
+def make_recording(bands, motion_envelope, *, scene=None, motion_source="true", **rest):
     recorder = make_recorder(None, bands, **({"duration": rest.get("duration", 4.0)} | (scene or {})))
     recorder.append(**make_signals(bands, motion_envelope, **rest), motion_source=motion_source)
     return recorder.finish()
 
 
-def make_play(reference: Any, motion: Any, position: Any = np.nan, **fields: Any) -> Recording:
+def make_play(reference, motion, position=np.nan, **fields):
     """Recording of a waveform without bands at `RATE`; `motion` is the same at every place, or (n, places)."""
-    n, bands = len(reference), Bands.none(spatial=False)
+    n, bands = len(reference), hr.Bands.none(spatial=False)
     recorder = make_recorder(None, bands, **({"duration": n / RATE, "settle": 0.0} | fields))
     motion = np.broadcast_to(np.reshape(motion, (n, -1)), (n, len(PLACES)))
     signals = make_signals(bands, np.zeros(0), duration=n / RATE, position=position)

@@ -1,16 +1,21 @@
-"""Boards in real time: a process behind a pseudo-terminal, five times as slow, beside the client's thread."""
+"""Boards in real time: a process behind a pseudo-terminal, five times as slow, and an emulated Cortex-M4."""
 
+import re
+import subprocess
 import threading
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from board import FINGER, RATE, SCENE, SlowClock, slow_board, slow_client, tones
+from synthetic import make_bands
+from test_firmware_m4 import NOISE, QEMU, built
 
 import hapticrender as hr
 from hapticrender.drivers.protocol import State
-from hapticrender.drivers.serial import SerialDriver
-from hapticrender.errors import DeviceLost, DriverError
+from hapticrender.drivers.serial import BoardClient, SerialDriver
+from hapticrender.errors import DriverError
 
 
 def wait_for(done, seconds=30.0):
@@ -19,18 +24,6 @@ def wait_for(done, seconds=30.0):
     while not done():
         assert time.monotonic() < end
         time.sleep(0.01)
-
-
-def test_an_unplugged_board_is_lost_with_port_operation_and_bytes(tmp_path):
-    with slow_board(tmp_path) as board, slow_client(board) as client:
-        client.set_bands(tones(47.0))
-        client.start()
-        board.kill()
-        lost = r"tty: (line|listen): .* \(\d+ bytes sent, \d+ received, 0 bad frames\)"
-        with pytest.raises(DeviceLost, match=lost):
-            wait_for(lambda: client.telemetry() and False)
-        with pytest.raises(DeviceLost, match=lost):
-            client.finger(0.0)
 
 
 def test_a_replugged_board_goes_on(tmp_path):
@@ -77,3 +70,26 @@ def test_two_threads_can_set_a_board(tmp_path):
             thread.join()
         commits = [float(line[3]) for line in board.log() if line[1] == "commit"]
         assert sorted(commits) == [47.0] + 10 * [50.0] + 10 * [60.0]
+
+
+def test_the_board_on_a_cortex_m4_speaks_to_the_host(exports, tmp_path):
+    """The same client as for any board, over the emulated machine's serial line: a pseudo-terminal."""
+    board = built(tmp_path, exports.rendering("tones"), "board-m4.elf")
+    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "pty"]
+    process = subprocess.Popen([*machine, "-kernel", board], stdout=subprocess.PIPE, text=True)
+    try:
+        port = re.search(r"/dev/\S+", process.stdout.readline())[0]
+        with BoardClient(port, timeout=20.0) as client:  # the emulator looks for its host once a second
+            envelope = np.array([10e-6, 4e-6])
+            client.set_bands(make_bands([70.0, 120.0], envelope))
+            start = client.start()
+            while client.telemetry().sample < start + RATE:
+                client.clock.sleep(0.05)
+            bands = client.telemetry().bands
+            client.stop()
+        for band, wanted in zip(bands, envelope, strict=True):
+            assert abs(band.target - wanted) < 1e-6 * wanted
+            assert abs(band.measured - wanted) < 0.02 * wanted + 3 * NOISE
+    finally:
+        process.kill()
+        process.communicate()

@@ -1,11 +1,15 @@
-"""The verb export: what it writes, refuses and ships."""
+"""The verb export: what it writes, refuses and ships; the stack of what it writes is bounded."""
 
 import fnmatch
+import re
+import subprocess
 import tomllib
+from graphlib import TopologicalSorter
 
 import pytest
-from board import FIRMWARE, ROOT
+from board import FIRMWARE, ROOT, SCENE, build_board
 
+import hapticrender as hr
 from hapticrender import cli
 from hapticrender.export import board_design, export, sources
 
@@ -36,3 +40,26 @@ def test_every_source_is_shipped():
     names = [f"firmware/{path.name}" for path in FIRMWARE.iterdir()]
     assert not [name for name in names if not any(fnmatch.fnmatch(name, each) for each in patterns)]
     assert {path.name for path in sources()} == {path.name for path in FIRMWARE.iterdir()}
+
+
+TABLE = re.compile(r"\{KIND_\w+, [^{}]*, (\w+)\}")  # the handlers of a board's commands, called through a pointer
+
+
+def test_no_function_of_the_board_calls_itself_nor_by_way_of_others(tmp_path):
+    """By gcc's own graph; a call through a pointer counts as one of every command's handler, and there is no other."""
+    try:
+        build_board(tmp_path, hr.prepare(SCENE), "-O0", "-fcallgraph-info")
+    except subprocess.CalledProcessError:
+        pytest.skip("no -fcallgraph-info here: install gcc 10")
+    calls = {}
+    for graph in tmp_path.glob("*.ci"):
+        for caller, called in re.findall(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"', graph.read_text()):
+            calls.setdefault(caller.rpartition("/")[2], set()).add(called.rpartition("/")[2])
+    assert [caller for caller in calls if "__indirect_call" in calls[caller]] == ["board_commands.c:execute"]
+    handlers = TABLE.findall((tmp_path / "board_commands.c").read_text())
+    known = {name.rpartition(":")[2]: name for name in calls}
+    assert len(handlers) == 13
+    assert set(handlers) <= set(known)
+    calls["__indirect_call"] = {known[name] for name in handlers}
+    assert any("law_step" in called for called in calls.values())
+    TopologicalSorter(calls).prepare()  # raises CycleError

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from finger_data import FREQUENCIES, make_impedance
 from scipy.stats import binom, chi2
-from subjects import population
+from subjects import FREQUENCIES, make_impedance, population
 
 import hapticrender as hr
 from hapticrender.analysis.models import FEWEST, LOAD_CLASSES

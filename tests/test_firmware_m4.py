@@ -10,8 +10,6 @@ from board import FIRMWARE, ROOT, SOURCES, compile_c
 from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
-from hapticrender.bands import Bands
-from hapticrender.drivers.serial import BoardClient
 from hapticrender.export import export
 
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
@@ -147,25 +145,3 @@ def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
     program = compile_c(tmp_path / "size", [tmp_path / "size.c"], f"-I{tmp_path}")
     size = int(subprocess.run([program], capture_output=True, text=True, check=True).stdout)
     assert 0 <= size - lines["state"][0] <= 8, "more than a shorter pointer"
-
-
-def test_the_board_on_a_cortex_m4_speaks_to_the_host(board):
-    """The same client as for any board, over the emulated machine's serial line: a pseudo-terminal."""
-    machine = [QEMU, "-M", "mps2-an386", "-display", "none", "-monitor", "none", "-serial", "pty"]
-    process = subprocess.Popen([*machine, "-kernel", board], stdout=subprocess.PIPE, text=True)
-    try:
-        port = re.search(r"/dev/\S+", process.stdout.readline())[0]
-        with BoardClient(port, timeout=20.0) as client:  # the emulator looks for its host once a second
-            envelope = np.array([10e-6, 4e-6])
-            client.set_bands(Bands(frequency=[70.0, 120.0], wavenumber=[0, 0], phase=[0, 0], envelope=envelope))
-            start = client.start()
-            while client.telemetry().sample < start + RATE:
-                client.clock.sleep(0.05)
-            bands = client.telemetry().bands
-            client.stop()
-        for band, wanted in zip(bands, envelope, strict=True):
-            assert abs(band.target - wanted) < 1e-6 * wanted
-            assert abs(band.measured - wanted) < 0.02 * wanted + 3 * NOISE
-    finally:
-        process.kill()
-        process.communicate()

@@ -5,7 +5,6 @@ import doctest
 import graphlib
 import importlib
 import inspect
-import os
 import pkgutil
 import re
 import subprocess
@@ -365,12 +364,6 @@ def test_cached_code_is_named_by_the_state_of_the_sources():
     assert error_step.function.__qualname__ == f"error_step_{digest()}"
 
 
-def test_benchmarks_find_the_kernels_that_tests_have_cached():
-    """Numba names the module that compiled a kernel: `strangers_plate` here, `tests.strangers_plate` there."""
-    code = "import benchmarks.faults, strangers_plate"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
-
-
 def test_every_benchmark_finds_what_it_imports():
     """But for packages of the extra `bench`, which it may lack here."""
     for module in pkgutil.walk_packages(benchmarks.__path__, "benchmarks."):
@@ -393,16 +386,3 @@ def test_every_test_that_the_page_on_safety_names_is_there():
         elif word.startswith("..._"):
             pattern = re.escape(word).replace(re.escape("..."), ".*")
             assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
-
-
-@pytest.mark.parametrize(
-    ("there", "status", "said"), [({}, 0, "skipped"), ({"HAPTICRENDER_PACKAGES": "there"}, 1, "failed")]
-)
-def test_what_is_skipped_for_want_of_a_package_fails_where_all_are_there(there, status, said):
-    """As in `.ci/run`; here no program at all is found."""
-    environment = {name: value for name, value in os.environ.items() if name != "HAPTICRENDER_PACKAGES"}
-    command = [sys.executable, "-m", "pytest", "-q", "-k", "memory_of_a_board", ROOT / "tests" / "test_firmware_m4.py"]
-    options = {"env": environment | there | {"PATH": ""}, "cwd": ROOT, "capture_output": True, "text": True}
-    done = subprocess.run(command, **options, check=False)
-    assert done.returncode == status, done.stdout
-    assert f" {said}, " in done.stdout

@@ -46,18 +46,6 @@ def through(function, values):
     return (tiles["y_re"] + 1j * tiles["y_im"]).ravel()[: len(values)]
 
 
-@pytest.mark.parametrize(
-    ("operation", "message"),
-    [
-        (lambda b: put(b, "y", get(b, "x_re") / get(b, "x")), "a complex vector divides nothing"),
-        (lambda b: put(b, "y_re", get(b, "x")), "field 'y_re' is real"),
-    ],
-)
-def test_an_operation_without_meaning_does_not_compile(operation, message):
-    with pytest.raises((numba.core.errors.NumbaError, TypeError), match=message):
-        through(kernel(operation), [1.0])
-
-
 def test_sine_and_cosine_of_turns(rng):
     """To 3e-15 within half a turn, quarter turns included; beyond it the whole turns go without a rounding."""
     quarters = np.arange(-8, 9) / 4

@@ -485,8 +485,7 @@ kept = next(sys.held)
 """
 
 
-@pytest.mark.parametrize("paced", [True, False])
-@pytest.mark.parametrize("enter", ["with player:", "if player.__enter__():"])
+@pytest.mark.parametrize(("enter", "paced"), [("with player:", True), ("if player.__enter__():", False)])
 def test_a_program_that_ends_before_its_with_statement_leaves_zero_drive(enter, paced, tmp_path):
     """A generator that waits in one, or an application that has entered by hand; the journal is whole."""
     played, journal = tmp_path / "played", tmp_path / "journal.au"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from electroadhesive import tone as friction_tone
-from finger_data import make_impedance
+from subjects import make_impedance
 from synthetic import make_bands, make_recording
 from tables import SIMULATED, scene_on, tables
 from test_kernel import plate_controller

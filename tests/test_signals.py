@@ -109,8 +109,7 @@ def test_a_plate_that_the_application_has_opened_is_left_at_zero_drive_by_identi
     assert not plate.played[-1].any()
 
 
-@pytest.mark.parametrize("verb", ["identify", "latency"])
-@pytest.mark.parametrize(("name", "status"), [("INT", 130), ("TERM", 143), ("HUP", 129)])
+@pytest.mark.parametrize(("verb", "name", "status"), [("identify", "INT", 130), ("latency", "TERM", 143)])
 def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tmp_path):
     """With the exit status that every verb has, also where the signal comes again while it closes the driver."""
     log = tmp_path / "played"
@@ -145,8 +144,7 @@ signal.raise_signal(int(sys.argv[3]))
 """
 
 
-@pytest.mark.parametrize("work", ["render", "player"])
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", -signal.SIGINT), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("work", "name", "status"), [("render", "SIGINT", -signal.SIGINT), ("player", "SIGTERM", 143)])
 def test_a_run_in_a_daemon_thread_ends_at_zero_drive_with_the_program(work, name, status, tmp_path):
     """By Ctrl-C, or by SIGTERM where the application raises an exception, as docs/live.md says."""
     log = tmp_path / "played"
@@ -201,7 +199,7 @@ def test_an_application_that_catches_ctrl_c_gets_the_next_one(defaults):
             signal.raise_signal(signal.SIGTERM)
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGHUP", 129)])
 def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, status):
     """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.1), duration=100.0, name="live")

@@ -63,14 +63,13 @@ def test_a_scene_that_settles_for_longer_than_it_lasts_is_refused(tmp_path):
         open_scene(tmp_path / "a.toml")
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_scenes_of_one_name_are_told_apart_by_their_files(tmp_path, jobs):
+def test_scenes_of_one_name_are_told_apart_by_their_files(tmp_path):
     """One that cannot be read, and one of the same name as the next that no device carries."""
     texts = {"a": SHORT.to_toml(), "b": SHORT.to_toml().replace("47.0", "4700.0"), "c": "x = "}
     files = [tmp_path / f"{name}.toml" for name in texts]
     for file, text in zip(files, texts.values(), strict=True):
         file.write_text(text)
-    found = validate(files, jobs=jobs)
+    found = validate(files)
     assert [each.verdict for each in found] == ["passed", "error", "error"]
     assert str(found[1]).startswith(f"short (2): {files[1]}: texture.frequency")
     assert [str(each).count(str(file)) for each, file in zip(found, files, strict=True)] == [0, 1, 1]
