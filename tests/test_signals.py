@@ -199,7 +199,7 @@ def test_an_application_that_catches_ctrl_c_gets_the_next_one(defaults):
             signal.raise_signal(signal.SIGTERM)
 
 
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGHUP", 129)])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, status):
     """By Ctrl-C, or by whoever ends processes: the journal is whole, and the page about it is written."""
     scene = hr.Scene(texture=RIDGES, finger=hr.Finger.swiping(2.0, speed=0.1), duration=100.0, name="live")

@@ -18,6 +18,7 @@ from hapticrender.control import controller_design
 from hapticrender.control.controller import BankController
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
+from hapticrender.plants import ultrasonic_surface
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Flag
