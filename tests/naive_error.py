@@ -42,7 +42,7 @@ class NaiveError:
         self.raw, self.target, self.R, self.rest, self.force_then, self.R_then = (zero[0].copy() for _ in range(6))
         self.w_then = np.zeros(self.K)
         self.l, self.r, self.past = np.zeros(n), np.zeros(n), np.zeros((n, self.taps.shape[1]))
-        self.x = self.smooth_x = self.velocity = self.acceleration = self.speed = self.fresh = 0.0
+        self.x = self.smooth_x = self.velocity = self.acceleration = self.speed = self.smooth_speed = self.fresh = 0.0
         self.seen = self.contact = False
         self.lever = self.m = self.b = self.k = self.peak = 0.0
         self.timer, self.open = [0.0, 0.0], [0.0, 0.0]  # of the fast and the slow detector
@@ -113,6 +113,7 @@ class NaiveError:
         if jumped or not abs(position) <= FAR:
             self.seen, self.acceleration = False, 0.0
             self.speed, self.fresh = 0.0 if jumped else (1 - a * T) * self.speed, max(self.fresh - 1, 0)
+            self.smooth_speed = 0.0 if jumped else self.smooth_speed + a * T * (self.speed - self.smooth_speed)
             return
         moved = abs(position - self.x) / T if self.seen else 0.0
         self.velocity = self.velocity if self.seen else 0.0
@@ -122,6 +123,7 @@ class NaiveError:
         self.velocity += T * self.acceleration + 3 * a**2 * T * error
         self.acceleration += a**3 * T * error
         self.speed += a * T * (moved - self.speed)
+        self.smooth_speed += a * T * (self.speed - self.smooth_speed)
         self.fresh = max(self.fresh - 1, 0) if self.seen else FRESH / T
         self.x, self.seen = position, True
 
@@ -141,7 +143,7 @@ class NaiveError:
         heard = np.where(follows, smooth(4 * (edge - f / p["highest"])), 1.0)
         self.share = np.minimum(grown * heard / np.maximum(self.fade, 1e-9), 1.0)
         if p["corrected"] and self.locked:
-            lag = p["contact_lag"] / max(self.speed, 0.1 * p["typical_speed"])
+            lag = p["contact_lag"] / max(2 * self.speed - self.smooth_speed, 0.1 * p["typical_speed"])
             self.shown = np.exp(-1j * p["sensor_delay"] * self.w) * (1 + 1j * lag * self.w)
         return carrier
 

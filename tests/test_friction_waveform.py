@@ -8,8 +8,10 @@ from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
+from hapticrender.control.inverse import FRICTION, FRICTION_NOISE
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.plants.identify_friction import identify_screen
+from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 RATE = 5000.0
@@ -99,7 +101,7 @@ def ridges(wavelength=1e-3, speed=0.05, rate=10e3):
 def test_recorded_ridges_follow_a_finger_that_swipes(device):
     swipe = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4)
     recording = hr.render(hr.Scene(texture=ridges(), finger=swipe, device=device, duration=2.0, seed=2))
-    assert waveform_error(recording) < MUST  # ultrasonic: 2.99 to 3.02 % over six seeds of the noise
+    assert waveform_error(recording) < MUST  # ultrasonic: 2.60 to 2.68 % over three seeds of the noise; a screen 0.97 %
 
 
 def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
@@ -156,14 +158,17 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     assert recording.summary()["verdict"] != "passed"
 
 
-@pytest.mark.parametrize(("wavelength", "learning"), [(1e-3, 0.0005), (0.5e-3, 0.005)])
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, learning):
+@pytest.mark.parametrize("wavelength", [1e-3, 0.5e-3])
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
     """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
 
-    Open loop the finger is exactly what the design assumes.  What is learned of it anew in every stroke, from a sensor
-    with noise, costs ridges of 0.5 mm 0.25 points: 0.81 % open, 1.06 % closed; of 1 mm 1.22 % both.
+    Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise.  With
+    c the prior's variance over that assumed of N samples, a Kalman filter makes of noise of variance s^2 the variance
+    s^2/N (c N/(1 + c N))^2 of the waveform, at most c s^2/4 whatever N is: of 0.4 of the waveform and 0.05 N that is
+    0.4 s/(2 * 0.05 N), 0.4 % for 1 mN; two standard deviations.  A sensor without noise costs nothing.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
+    learned = 2 * FRICTION[0] * SlidingParameters().force_noise / (2 * FRICTION_NOISE)
 
     def signed(sample, sensed):
         way = np.diff(finger.position(np.array([sample, sample + 1]) / 10e3))
@@ -171,12 +176,13 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, learnin
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
     late = slice(5000, 9_500)
-    for blind in (True, False):
-        screen = Screen(blind=blind, finger=finger, tell=signed)
+    for name, sensor in {"open": {}, "closed": {"blind": False}, "quiet": {"blind": False, "force_noise": 0.0}}.items():
+        screen = Screen(finger=finger, tell=signed, **sensor)
         scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.0)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
-        errors[blind] = np.std(played - asked) / np.std(asked)
-    assert max(errors.values()) < 0.02
-    assert errors[False] < errors[True] + learning
+        errors[name] = np.std(played - asked) / np.std(asked)
+    assert max(errors.values()) < 0.011
+    assert errors["quiet"] < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
+    assert errors["closed"] < np.hypot(errors["open"], learned)

@@ -47,6 +47,7 @@ def track_finger(controller, position):
     if leapt or not abs(position) <= FARTHEST:
         c.acceleration = c.finger_seen = 0.0
         c.speed = 0.0 if leapt else c.speed - pole * c.speed
+        c.smooth_speed = 0.0 if leapt else c.smooth_speed + pole * (c.speed - c.smooth_speed)
         c.fresh = max(c.fresh - 1.0, 0.0)
         return
     came = c.finger_seen <= 0.0
@@ -59,6 +60,7 @@ def track_finger(controller, position):
     c.velocity += period * c.acceleration + 3.0 * pole * TRACKER_POLE * innovation
     c.acceleration += pole * TRACKER_POLE * TRACKER_POLE * innovation
     c.speed += pole * (moved - c.speed)
+    c.smooth_speed += pole * (c.speed - c.smooth_speed)
     c.fresh = FRESH_TIME * c.p.rate if came else max(c.fresh - 1.0, 0.0)
     c.held_position, c.finger_seen = position, 1.0
 
@@ -117,9 +119,13 @@ def fade_fixed(controller, t):
 
 @kernel
 def contact_lag(controller):
-    """Time (s) by which friction follows what the sensors show: the contact's length over the finger's speed."""
+    """Time (s) by which friction follows drive or sensors: the contact's length over the finger's speed.
+
+    The speed is that of Brown's double smoothing, without lag under constant acceleration.
+    """
     c = record(controller, CONTROLLER_T, 0)
-    return c.p.contact_lag / max(c.speed, SLOWEST * c.p.typical_speed) if c.p.contact_lag > 0.0 else 0.0
+    speed = max(2.0 * c.speed - c.smooth_speed, SLOWEST * c.p.typical_speed)
+    return c.p.contact_lag / speed if c.p.contact_lag > 0.0 else 0.0
 
 
 @kernel

@@ -214,8 +214,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
-        "contact_damping": model.contact_damping,
-        "contact_lag": model.contact_lag,
+        "contact_lag": contact_length(model),
         "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
@@ -251,6 +250,18 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
     }
 
 
+def before_contact(model: DeviceModel) -> dict[str, Array]:
+    """Mass, damping and stiffness without the lag of a sliding contact: M and C of (1 + lag s)(M s^2 + C s + K)."""
+    lag = contact_length(model) / model.typical_speed if model.contact_damping > 0.0 else 0.0
+    damping = model.damping - lag * model.stiffness
+    return {"mass": model.mass - lag * damping, "damping": damping, "stiffness": model.stiffness}
+
+
+def contact_length(model: DeviceModel) -> float:
+    """Length (m) by which a sliding contact lags behind the drive, or behind the sensors where they precede it."""
+    return model.contact_lag or float(model.contact_damping / model.stiffness[0, 0])
+
+
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
     """Fields of `INVERSE`."""
     period, n = 1.0 / model.rate, len(model.mass)
@@ -262,9 +273,9 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     for first, rate in (REVERSION_RATES | friction).items():
         factor[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
     matrices = {}
-    for name in ("mass", "damping", "stiffness"):
+    for name, value in before_contact(model).items():
         matrices[name] = np.eye(2)
-        matrices[name][:n, :n] = getattr(model, name)
+        matrices[name][:n, :n] = value
     top, order, late = min(model.highest_frequency, HIGHEST * model.rate), int(bands.differentiated), model.sensor_delay
     late *= model.rate  # what is sensed of the target is that of so many samples ago
     sensor = np.eye(TAPS)[TAPS // 2 - 1]
@@ -282,6 +293,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "pole": POLE,
         "pole_damping": POLE_DAMPING,
         "fade_step": period / FADE_IN,
+        "behind": float(model.contact_damping > 0.0),
         **law_times(model, noise[0]),
         "filters": derivative_filters(float(model.rate), float(top), order, 4, 0.5 - late),
         "sensor_filter": sensor,

@@ -40,7 +40,6 @@ from hapticrender.control.inverse_records import (
     TAPS,
 )
 from hapticrender.control.kernel import sense_block, update_confidence
-from hapticrender.control.laws import contact_damping
 from hapticrender.control.peak_limit import NONFINITE, SATURATED, drive_of, shape_noise
 from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, PAST_MASK, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
@@ -115,8 +114,8 @@ def find_basis(controller, inverse):
     w = v.omega_n
     basis[0], basis[1], basis[2] = d0, d1 / w, d2 / (w * w)
     basis[3], basis[4] = v.pole * v.pole * first, v.pole * poles[1]
-    damping = v.damping[0, 0] + contact_damping(controller)
-    basis[5] = (v.mass[0, 0] * d3 + damping * d2 + v.stiffness[0, 0] * d1) / record(controller, CONTROLLER_T, 0).p.rate
+    rate = record(controller, CONTROLLER_T, 0).p.rate
+    basis[5] = (v.mass[0, 0] * d3 + v.damping[0, 0] * d2 + v.stiffness[0, 0] * d1) / rate
     return d1, d2
 
 
@@ -300,7 +299,7 @@ def inverse_step(state, signals, start, count):
             discretise(state, inverse)
         d1, d2 = find_basis(state, inverse)
         s0, s1, d0 = c.p.pattern[0], c.p.pattern[1], v.basis[0]
-        along = v.stiffness[0, 0] * d0 + (v.damping[0, 0] + contact_damping(state)) * d1 + v.mass[0, 0] * d2
+        along = v.stiffness[0, 0] * d0 + v.damping[0, 0] * d1 + v.mass[0, 0] * d2
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other

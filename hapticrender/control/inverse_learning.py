@@ -6,6 +6,7 @@ and dev_u are states of the loaded device G, discretised anew as the estimate mo
 
 from numba import carray
 
+from hapticrender.control.carriers import contact_lag
 from hapticrender.control.inverse_records import (
     BASIS,
     COUPLING,
@@ -18,7 +19,6 @@ from hapticrender.control.inverse_records import (
     RING,
     ROWS,
 )
-from hapticrender.control.laws import contact_damping
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.mathx import TURN
@@ -55,13 +55,14 @@ def discretise(controller, inverse):
     mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
     h, per_c, per_m = v.lever, 1.0 / v.omega_n, 1.0 / (v.omega_n * v.omega_n)
-    m00 = corrected(v.mass[0, 0], per_m * theta[HEAVE + 2]) + mass
+    lag = v.behind * contact_lag(controller)
+    k00 = corrected(v.stiffness[0, 0], theta[HEAVE])
+    m00 = corrected(v.mass[0, 0] + lag * v.damping[0, 0], per_m * theta[HEAVE + 2]) + mass
     m01 = v.mass[0, 1] + coupled(v.mass[1, 1], per_m * theta[COUPLING + 2]) + h * mass
     m11 = v.mass[1, 1] + h * h * mass
-    c00 = corrected(v.damping[0, 0] + contact_damping(controller), per_c * theta[HEAVE + 1]) + damping
+    c00 = corrected(v.damping[0, 0] + lag * k00, per_c * theta[HEAVE + 1]) + damping
     c01 = v.damping[0, 1] + coupled(v.damping[1, 1], per_c * theta[COUPLING + 1]) + h * damping
     c11 = corrected(v.damping[1, 1], per_c * theta[HEAVE + 1]) + h * h * damping
-    k00 = corrected(v.stiffness[0, 0], theta[HEAVE])
     k01 = v.stiffness[0, 1] + coupled(v.stiffness[1, 1], theta[COUPLING])
     k11 = corrected(v.stiffness[1, 1], theta[HEAVE])
     scale = 1.0 / (m00 * m11 - m01 * m01)

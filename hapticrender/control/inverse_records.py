@@ -11,8 +11,8 @@ FINGER, HEAVE, COUPLING, LOAD, INITIAL, PARAMETERS = np.array([0, 5, 9, 12, 14, 
 ROWS = int(PARAMETERS) + 1  # regressors psi_i, and dev_u
 RING = BASIS + 2  # of a sample: basis and deviation force, until they act
 
-# 1/m; w_n, w_p (rad/s) and damping ratio of the finger's poles; steps of the fade
-_LAW = "lever_per_metre omega_n pole pole_damping fade_step"
+# 1/m; w_n, w_p (rad/s) and damping ratio of the finger's poles; steps of the fade; 1: sensors lie behind the contact
+_LAW = "lever_per_metre omega_n pole pole_damping fade_step behind"
 # after a contact, in samples: learning begins, begins again, has no initial motion any more, the damper closes;
 # samples within which a contact is reported; without a position, by which it is lost
 _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"

@@ -108,7 +108,7 @@ SETTINGS = np.dtype(
 """Settings of a controller, as its design derived them; `hapticrender.control.controller_design` derives them."""
 
 _STATE = """
-held_position held_prediction smooth_position velocity acceleration finger_seen fresh speed table_velocity
+held_position held_prediction smooth_position velocity acceleration finger_seen fresh speed smooth_speed table_velocity
 load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
 gain damping_gain damper_scale dc_fast_on feedback_off

@@ -22,6 +22,7 @@ from hapticrender.control.supervisor_kernel import (
     INCONSISTENT,
     INVALID,
     INVALID_SHARE,
+    JUMP,
     OVERMOTION,
     RINGING,
     ROOT2,
@@ -51,6 +52,7 @@ RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
 TILT_TIMES = 10e-3, 0.1, 60e-3  # s: low-pass, high-pass, mean; about the 50 ms in which a device is levelled
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
+FRICTION_TIME, FRICTION_SIGMAS = 20e-3, 20.0  # s, of the mean friction; of the noise: a smaller one is not judged
 DANGER_DRIVE = 0.9  # of the drive limit
 UNLIMITED = 1e300
 
@@ -58,7 +60,7 @@ UNLIMITED = 1e300
 class Fault(NamedTuple):
     """Why a supervisor has stopped the drive."""
 
-    cause: int  # INVALID to SWAPPED
+    cause: int  # INVALID to JUMP
     sample: int  # at which the test failed; the drive fades out from it on
     sensors: int  # bit i: sensor i + 1; of INVALID, FROZEN, BEYOND, SENSOR_GAIN and SWAPPED; actuator of ACTUATOR_GAIN
     gains: tuple[float, ...] = ()  # of all sensors or actuators, over those before; of SENSOR_GAIN and ACTUATOR_GAIN
@@ -121,6 +123,11 @@ CAUSES = {
     SWAPPED: (
         "sensor {sensor}: each shows the motion of the other; most likely they are swapped, or the actuators",
         "wiring of all sensors and actuators",
+    ),
+    JUMP: (
+        "the friction jumped from one sample to the next, as no contact can; most likely the sensor is disconnected, "
+        "or its gain has changed",
+        "cable, supply, range and gain of the sensor",
     ),
 }
 
@@ -244,6 +251,8 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "fade_now": min(model.pace / (FADE_NOW * rate), 1.0),
         **_limit_settings(controller, model),
     }
+    if model.contact_damping > 0.0 and model.sensor_delay * rate >= 1.0:  # a sensor behind the contact, with a mass
+        settings |= {"least_friction": FRICTION_SIGMAS * noise, "friction_pole": _pole(FRICTION_TIME, rate)}
     if demand is None:
         return settings
     modelled = demand.lowest < rate / 10  # beyond it neither trapezoidal rule nor hold are the device's

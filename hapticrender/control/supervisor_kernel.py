@@ -26,6 +26,8 @@ no  cause        condition                                                      
 11  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
                  see `gains`                                                                      5 ms and more
                  or the drive tilts the device the wrong way, see `check_tilt`                    60 ms (mean)
+12  jump         a tribometer shows a friction that changes by half within one sample and by less
+                 than a quarter of that in the samples before and after                           at once
 === ============ ================================================================================ ====================
 
 R (m) and B (drive unit) are what the scene needs at most with the worst finger, A the drive of a hard press, `sag` the
@@ -34,8 +36,8 @@ fades out in 2 ms, on overmotion in 0.2 ms, and stays at zero.  A ringing damper
 drive stops where it rings all the same for 150 ms.
 
 Tests 3 to 5, 7 and 9 to 11 need a `Demand`, 9 to 11 at most two sensors and actuators; 6 a controller with an inner
-damper; 8 a limit.  Without them a controller has tests 1 and 2.  Causes have these numbers.  `limit_rms_drive` holds
-the device's limit of rms drive, where it has one.  `control.supervisor` designs all of it.
+damper; 8 a limit; 12 a sensor behind its contact.  Without them a controller has tests 1 and 2.  Causes have these
+numbers.  `limit_rms_drive` holds the device's limit of rms drive, where it has one.  `control.supervisor` designs it.
 """
 
 import math
@@ -50,7 +52,7 @@ from hapticrender.jit import F8, I8, SIGNALS_T, call, kernel, pointer, record, s
 from hapticrender.protocols import Flag
 
 INVALID, FROZEN, INCONSISTENT, ACTIVE, DRIVE, RINGING, OVERMOTION, BEYOND = range(1, 9)
-SENSOR_GAIN, ACTUATOR_GAIN, SWAPPED = range(9, 12)
+SENSOR_GAIN, ACTUATOR_GAIN, SWAPPED, JUMP = range(9, 13)
 EVERY = (1 << MOST) - 1  # sensors whose gains are compared, as bits
 STOPPED, SATURATED = int(Flag.STOPPED), int(Flag.SATURATED)
 ROOT2 = math.sqrt(2.0)
@@ -63,12 +65,14 @@ SLOW_POWER, SLOW_FORCE = 0.65, 3.0  # healthy: below 0.03, with a finger negativ
 RINGING_STEP = 0.4
 LEAST_TILTED, MOST_TILTED = 0.85, 1.2  # eta of swapped sensors is (1 + K/K_true)/2 of rocking's stiffness, of coils 1
 LEAST_MOMENT, UNEXPLAINED_MOMENT = 0.1, 3e-3  # N; of its energy: 0.19 and more in 20 minutes of normal scenes
+JUMP_SHARE, JUMP_NEIGHBOURS = 0.5, 0.25  # of the friction before; of the jump: a mass shows 0.41 of it or more
+JUMP_INVALID = 0.01  # share of invalid samples, whose values are held
 
 _SETTINGS = """
 sensor_limit invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole
 ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
 sensed_bound drive_limit heat_pole heat_gain slow_pole
-fade_out fade_now tilt_low tilt_high tilt_pole lever_per_metre
+fade_out fade_now tilt_low tilt_high tilt_pole lever_per_metre least_friction friction_pole
 """.split()
 _TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
@@ -98,6 +102,7 @@ SUPERVISOR = np.dtype(
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
         *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
+        ("friction", np.float64, (4,)),  # of test 12: mean until three samples ago, and those three, oldest first
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
         ("tilt", np.float64, (2, 3)),  # low-pass, twice, and slow mean: of the moment left, of twice the drive
         ("tilt_energy", np.float64, (3,)),  # of the one, of both, of the other
@@ -191,6 +196,20 @@ def check_sensors(supervisor, sensed, n, drive, acts):
     if cause > 0 and s.cause == 0:
         s.sensors = invalid if cause == INVALID else frozen if cause == FROZEN else beyond
     return cause
+
+
+@kernel
+def check_jump(supervisor, slides):
+    """Test 12: whether a friction has jumped between two samples, as behind a tribometer's mass no contact can."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    f, now, p = s.friction, s.last[0], s.p
+    mean, before, first, second = f[0], f[1], f[2], f[3]
+    jump = abs(second - first)
+    alone = max(abs(first - before), abs(now - second)) < JUMP_NEIGHBOURS * jump
+    steady = mean > p.least_friction and abs(first - mean) < 0.5 * mean and s.invalid < JUMP_INVALID
+    f[0] = mean + p.friction_pole * (before - mean) if slides else 0.0
+    f[1], f[2], f[3] = first, second, now
+    return steady and alone and jump > JUMP_SHARE * mean
 
 
 @kernel
@@ -386,6 +405,8 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     cause = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
+    if p.least_friction > 0.0 and check_jump(supervisor, position[n] == position[n]) and cause == 0:
+        cause = JUMP
     if p.modelled > 0:
         if s.compared == 0:  # a steady load is no motion
             for i in range(2):
