@@ -69,8 +69,8 @@ def keyed(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Compile a function on its first call, as a part of the kernels and steps that call it."""
-    return numba.njit(function, **OPTIONS)
+    """Compile a function on its first call, into the code of the kernels and steps that call it."""
+    return numba.njit(function, forceinline=True, **OPTIONS)
 
 
 def entry(function: Callable[..., Any]) -> Any:

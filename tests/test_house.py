@@ -304,7 +304,7 @@ IN_INTRINSICS = {  # attributes of what numba hands to a code generator, and of 
     "signature": {"args", "return_type"},
     "typingctx": set(),
 }
-OPTIONS = {"cache", "error_model", "fastmath", "nogil", "_nrt"}  # of njit and cfunc
+OPTIONS = {"cache", "error_model", "fastmath", "forceinline", "nogil", "_nrt"}  # of njit and cfunc
 
 
 def bound_names(tree):

@@ -49,7 +49,6 @@ GAINS = np.dtype(
         *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
         ("duration", np.int64),  # samples of a trial
         ("models", np.float64, (2 + 2 * CHANGES, 6)),
-        ("advanced", np.float64, (4,)),
         ("w", np.float64, (CHANGES, MOST)),  # of both sensors
         *((name, np.float64, (MOST,)) for name in ("e", "mean", "energy")),  # mean of e^2 of a sensor; sums of e^2
         ("weights", np.float64, (2, CHANGES, CHANGES)),  # sums of w_i w_j of sensors, of actuators
@@ -112,14 +111,11 @@ def _filter(a: Array, c: Array, wander: float) -> tuple[Array, float]:
 def advance_model(gains, k, force0, force1):
     """Advance model k by a sample, under the force that acts."""
     s = record(gains, GAINS_T, 0)
-    x, advanced, a, b = s.models[k], s.advanced, s.step_state, s.step_force
+    x, a, b = s.models[k], s.step_state, s.step_force
     force0, force1 = force0 + x[4], force1 + x[5]
+    x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
     for i in range(4):
-        advanced[i] = b[i, 0] * force0 + b[i, 1] * force1
-        for j in range(4):
-            advanced[i] += a[i, j] * x[j]
-    for i in range(4):
-        x[i] = advanced[i]
+        x[i] = b[i, 0] * force0 + b[i, 1] * force1 + a[i, 0] * x0 + a[i, 1] * x1 + a[i, 2] * x2 + a[i, 3] * x3
 
 
 @kernel

@@ -45,7 +45,7 @@ from hapticrender.control.records import (
 )
 from hapticrender.control.sums import correlate, invert, solve, sum_bands, turn_tables
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
-from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, zeros
+from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, some, square, total, zeros
 
 LEAST_LOAD = 0.03  # N: a smaller load shows no place
 CONFIDENCE_FADE = 0.02  # s: within this the drive fades out while a sensor's samples are implausible
@@ -134,11 +134,13 @@ def analyse_block(controller):
 def predict(controller, i):
     """Sums over the bands of a coordinate: what the sensors should show, and the commanded motion."""
     c = record(controller, CONTROLLER_T, 0)
-    pattern, shown, command = c.p.pattern[i], zeros(), zeros()
+    shown, command = zeros(), zeros()
     for t in range(c.tiles):
         b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(controller, t), COORDINATE_T, i)
-        shown = shown + real((pattern * get(b, "expected") + get(x, "e")) * get(b, "carrier"))
-        command = command + real((pattern * get(b, "r") + get(x, "v")) * get(b, "carrier"))
+        carrier = get(b, "carrier")
+        reference = c.p.pattern[i] * real(get(b, "r") * carrier)
+        shown = shown + (reference + real(get(x, "e") * carrier))
+        command = command + (reference + real(get(x, "v") * carrier))
     return total(shown), total(command)
 
 
@@ -209,8 +211,8 @@ def innovate_block(controller):
 def update_envelopes(controller, integral):
     """Update error envelopes, integral parts and slopes of the commands of all bands, and run the detectors.
 
-    Returns the sums of squares by which demodulated deviations exceed the levels of the two detectors.  Sample by
-    sample the deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
+    Returns whether demodulated deviations exceed the levels of the two detectors in any band.  Sample by sample the
+    deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
     """
     c = record(controller, CONTROLLER_T, 0)
     p, samples, period, back = c.p, samples_of(controller), c.p.block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
@@ -231,8 +233,7 @@ def update_envelopes(controller, integral):
                 fast, slow = get(x, "fast"), get(x, "slow")
                 fast = fast + p.fast_pole * (deviation - fast)
                 slow = slow + p.slow_pole * (fast - slow)
-                over = over + maximum(square(fast) - p.fast_threshold, 0.0)
-                above = above + maximum(square(slow) - p.slow_threshold, 0.0)
+                over, above = maximum(over, square(fast)), maximum(above, square(slow))
                 put(x, "fast", fast)
                 put(x, "slow", slow)
             e = (1.0 - period * fading) * e + gain * found
@@ -241,7 +242,7 @@ def update_envelopes(controller, integral):
             # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
             put(x, "v", v + period * (slope - back * (v + p.pattern[i] * reference)))
             put(x, "slope", slope + p.pattern[i] * rise)
-    return total(over), total(above)
+    return some(over > p.fast_threshold), some(above > p.slow_threshold)
 
 
 @kernel
@@ -318,11 +319,11 @@ def find_contact(controller, adapt_now):
     c = record(controller, CONTROLLER_T, 0)
     p, k = c.p, c.p.stiffness
     load = -(k[0, 0] * c.dc[0] + k[0, 1] * c.dc[1])
-    moment = -(k[1, 0] * c.dc[0] + k[1, 1] * c.dc[1])
     on = 1.0 if load > (p.contact_off if c.contact > 0.0 else p.contact_on) else 0.0
     changed = on != c.contact
     c.load, c.contact = load, on
     if on > 0.0 and (adapt_now or changed):
+        moment = -(k[1, 0] * c.dc[0] + k[1, 1] * c.dc[1])
         c.lever = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
     if changed:
         c.fast_timer, c.fast_open = p.fast_time, 1.0
@@ -351,9 +352,9 @@ def close_block(controller, touching, adapt_now):
     update_law(controller, touching, adapt_now)
     if touching and block > 1:
         note_commands(controller)
-    if fast > 0.0:
+    if fast:
         c.fast_timer = p.fast_time
-    if slow > 0.0:
+    if slow:
         c.slow_timer = p.slow_time
     c.fast_open = 1.0 if c.fast_timer > 0.0 else max(c.fast_open - p.release, 0.0)
     c.slow_open = 1.0 if c.slow_timer > 0.0 else max(c.slow_open - p.release, 0.0)

@@ -34,33 +34,30 @@ def drive_of(controller, samples, row, m, i):
 def largest_drive(controller, samples, force, quadrature, with_quadrature):
     """Largest drive of a block over its limit, squared: of the samples, or of the analytic signal's envelope."""
     c = record(controller, CONTROLLER_T, 0)
-    peak = 0.0
-    scale = c.confidence / c.p.drive_limit
+    peak, scale = 0.0, c.confidence / c.p.drive_limit
     for i in range(c.p.channels):
         for m in range(c.p.block):
-            along = scale * drive_of(controller, samples, force, m, i)
-            across = scale * drive_of(controller, samples, quadrature, m, i) if with_quadrature else 0.0
+            along = drive_of(controller, samples, force, m, i)
+            across = drive_of(controller, samples, quadrature, m, i) if with_quadrature else 0.0
             peak = max(peak, along * along + across * across)
-    return peak
+    return scale * scale * peak
 
 
 @kernel
 def limit_drive(controller, samples, force, peak, drive, flags, first):
     """Scale the whole envelope into the limit, round, and write the drive of a block."""
     c = record(controller, CONTROLLER_T, 0)
-    before, after, limit = c.scale, 1.0, c.p.drive_limit
-    c.peak_squared = peak
-    if peak > 1.0:
-        after = 1.0 / math.sqrt(peak)
-    for m in range(c.p.block):
-        scale = c.confidence * (before + (after - before) * (m + 1.0) / c.p.block)
+    confidence, limit, block = c.confidence, c.p.drive_limit, c.p.block
+    before, after = c.scale, 1.0 / math.sqrt(peak) if peak > 1.0 else 1.0
+    c.peak_squared, c.scale = peak, after
+    for m in range(block):
+        scale = confidence * (before + (after - before) * (m + 1.0) / block)
         for i in range(c.p.channels):
             exact = scale * drive_of(controller, samples, force, m, i)
-            if c.confidence == 0.0:
+            if confidence == 0.0:
                 c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
             elif c.p.drive_step > 0.0:
                 exact = shape_noise(controller, exact, i)
             drive[first + m, i] = min(max(exact, -limit), limit)
         if after < 1.0:
             flags[first + m] |= SATURATED
-    c.scale = after

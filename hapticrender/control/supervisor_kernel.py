@@ -106,7 +106,8 @@ SUPERVISOR = np.dtype(
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
         ("tilt", np.float64, (2, 3)),  # low-pass, twice, and slow mean: of the moment left, of twice the drive
         ("tilt_energy", np.float64, (3,)),  # of the one, of both, of the other
-        ("energy", np.float64, (12,)),  # of q, v, a, dF, F, r in both coordinates
+        ("signals", np.float64, (12,)),  # q, v, a, dF, F, r in both coordinates, and their energies
+        ("energy", np.float64, (12,)),
         *((name, np.float64, (MOST_CHANNELS,)) for name in ("drive_energy", "heat")),
         *((name, np.float64, (MOST_SENSORS,)) for name in ("last", "least", "most", "least_change", "most_change")),
         *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest", "frame_repeats")),
@@ -250,7 +251,7 @@ def check_growth(supervisor, residual):
 def check_motion(supervisor):
     """Tests 3, 4 and 7: whether the motion follows from the drive; returns the cause, or 0."""
     s = record(supervisor, SUPERVISOR_T, 0)
-    p, e, value, rate, change = s.p, s.energy, s.value, s.rate, s.change
+    p, x, e, value, rate, change = s.p, s.signals, s.energy, s.value, s.rate, s.change
     last0, last1 = value[2], value[3]
     filter_signals(supervisor)
     s.motion = abs(value[0]) + p.lever * abs(value[1])
@@ -265,9 +266,10 @@ def check_motion(supervisor):
         if i == 0:
             grows = check_growth(supervisor, r)
         step = force - (last0 if i == 0 else last1)
-        for k, signal in enumerate((q, v, a, step, force, r)):
-            e[2 * k + i] += p.energy_pole * (signal * signal - e[2 * k + i])
+        x[i], x[2 + i], x[4 + i], x[6 + i], x[8 + i], x[10 + i] = q, v, a, step, force, r
         s.power[i] += p.power_pole * (-r * v - s.power[i])
+    for k in range(12):
+        e[k] += p.energy_pole * (x[k] * x[k] - e[k])
     for i in range(2):
         bound, residual, drive, power = p.noise[i], e[10 + i], e[8 + i], s.power[i]
         for j in range(8):
@@ -317,11 +319,15 @@ def compare_gains(supervisor, position):
         k = p.stiffness
         start_gains(p.gains, q[0], q[1], k[0, 0] * q[0] + k[0, 1] * q[1], k[1, 0] * q[0] + k[1, 1] * q[1])
     sensors, actuators, swapped = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    if check_tilt(supervisor, position):
+        return SWAPPED, EVERY
+    if sensors == 0 and actuators == 0 and not swapped:
+        return 0, 0
     for i in range(p.sensors):
         if 2 * s.repeats[i] > p.frozen_time:  # that is for test 2 to find
             sensors &= ~(1 << i)
             swapped = False
-    if check_tilt(supervisor, position) or swapped:
+    if swapped:
         return SWAPPED, EVERY
     if sensors > 0:
         return SENSOR_GAIN, sensors

@@ -257,6 +257,10 @@ class Plate(CompiledPlant):
         inputs[:, :3] = self.finger.touch((first + np.arange(n)) / self.rate)
         return inputs
 
+    def noise(self, n: int) -> Array:
+        """Draw the noise of both sensors; nothing is drawn where they have none."""
+        return super().noise(n) if self.parameters.sensor_noise > 0.0 else np.zeros((n, 2))
+
 
 def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Array) -> Array:
     """State of the compiled plate at rest, with the `queue` of its drive."""
