@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import NYQUIST_MARGIN, Bands
-from hapticrender.control.controller_design import FADE_IN
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
+from hapticrender.defaults import FADE_IN
 from hapticrender.mathx import smoothstep
 from hapticrender.protocols import Array
 from hapticrender.renderers.base import Waveform

@@ -28,8 +28,8 @@ from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
 from hapticrender.control.margin_check import checked_settings
 from hapticrender.control.supervisor import damper_settings
+from hapticrender.defaults import FADE_IN
 
-FADE_IN = 0.05  # s: a target fades in this slowly, so that it does not excite the modes
 LEAST_FADE_IN = 0.5e-3  # s: however fast the device, as drives are finite
 FAST_POLE, FAST_SIGMAS = 30.0, 5.5  # Hz, of the sensor noise behind that pole
 SLOW_POLE, SLOW_SIGMAS = 4.0, 5.0

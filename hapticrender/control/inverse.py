@@ -9,7 +9,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, padded, shared_settings
-from hapticrender.control.controller_design import FADE_IN, design_controller, rules_for
+from hapticrender.control.controller_design import design_controller, rules_for
 from hapticrender.control.damping import Damping, choose_damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import REVERSION, SCALED, inverse_step
@@ -26,6 +26,7 @@ from hapticrender.control.inverse_records import (
 )
 from hapticrender.control.records import MOST_CHANNELS, aligned
 from hapticrender.control.supervisor import damper_settings
+from hapticrender.defaults import FADE_IN
 from hapticrender.mathx import foh
 from hapticrender.protocols import Array
 

@@ -84,6 +84,7 @@ def take_reference(controller, inverse, waveform):
     else:
         value = bands_ahead(controller, (v.delay + TAPS // 2) / c.p.rate)
     value *= v.smooth_scale
+    # the value is of d + TAPS/2 samples ahead; d later, tap TAPS/2 - 1 of `expected` is of now
     window, expected, ring = v.window, v.sensor_window, carray(pointer(v.reference_at, F8), v.delay)
     at = v.sample % v.delay
     for i in range(TAPS - 1):
@@ -280,7 +281,7 @@ def inverse_step(state, signals, start, count):
         learning = follow_contact(state, inverse)
         take_reference(state, inverse, waveform[n] if c.p.analysed > 0.0 else 0.0)
         error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
-        samples[Y, 0] = samples[Y + 1, 0] = 0.0
+        samples[Y, 0] = samples[Y + 1, 0] = 0.0  # from here on forces: the damper's first
         if update_confidence(state, implausible):
             reset_parameters(inverse, FINGER, PARAMETERS)
         elif v.learns > 0:

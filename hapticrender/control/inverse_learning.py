@@ -161,10 +161,10 @@ def restart_regressors(inverse):
 
 @kernel
 def restart(inverse):
-    """Learn afresh from here on, with the deviation of now as four more parameters; the estimates stay.
+    """Learn afresh from here on, with the deviation of now as four more parameters.
 
-    The covariance returns to the prior: what the ringing of a contact taught through a model without the finger is not
-    as certain as it seemed.
+    Estimates of finger and load stay, with the prior's covariance: what the ringing of a contact taught through a model
+    without the finger is not as certain as it seemed.  Those of the device return to what was noted before the contact.
     """
     v = record(inverse, INVERSE_T, 0)
     covariance = v.covariance
@@ -239,7 +239,7 @@ def follow_contact(controller, inverse):
 def learn(inverse, coordinate, error):
     """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
     v = record(inverse, INVERSE_T, 0)
-    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs
+    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs  # `inputs` as scratch
     explained = states[coordinate, PARAMETERS]
     innovation = error - explained
     for i in range(PARAMETERS):

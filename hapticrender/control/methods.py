@@ -28,7 +28,7 @@ from hapticrender.control.controller import (
     shared_settings,
     spacing,
 )
-from hapticrender.control.controller_design import FADE_IN, ONE_SPEED, Rules, design_controller, rules_for
+from hapticrender.control.controller_design import ONE_SPEED, Rules, design_controller, rules_for
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import DiscretePlant
@@ -36,6 +36,7 @@ from hapticrender.control.loopshape import Bandwidths, TransferFunction, envelop
 from hapticrender.control.low_pass import low_pass_step
 from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned
+from hapticrender.defaults import FADE_IN
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
 

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticrender.bands import Bands
-from hapticrender.defaults import LOWEST_FREQUENCY
+from hapticrender.defaults import FADE_IN, LOWEST_FREQUENCY
 from hapticrender.protocols import Array
 from hapticrender.recordings.recording import Recording
 
 SHORTEST_WINDOW = 20e-3  # s
-FADE_IN = 0.05  # s
 PERIODS = 2.0  # of the lowest carrier and of the smallest spacing in a window
 HOPS = 2  # window starts in a window's length
 HOPS_LOCKED = 8  # the same where carriers are locked to the finger, which is seldom fast enough for long

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.defaults import FADE_IN
 from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
-from hapticrender.recordings.envelopes import DIVERGING, FADE_IN, RUNAWAY, Envelopes, amplitude_error, judged_from
+from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, Envelopes, amplitude_error, judged_from
 from hapticrender.recordings.recording import Recording
 from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, WINDOW
 
