@@ -125,25 +125,17 @@ def render(
     return run(rendering, journal=journal, progress=progress)
 
 
-def run(
-    rendering: Rendering,
-    *,
-    journal: str | Path | None = None,
-    progress: Progress | None = None,
-    begin: Callable[[], object] = lambda: None,
-) -> Recording:
-    """Play a prepared rendering to its end; see `render`.  `begin` is called before the first sample is recorded.
+def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Progress | None = None) -> Recording:
+    """Play a prepared rendering to its end; see `render`.
 
     However it ends (an error, a signal as docs/safety.md says), every sample played is recorded and the device is left
     at zero drive.
     """
     driver, total = rendering.driver, rendering.samples
-    recorder, begins = recorder_of(rendering, journal, requested=rendering.requested), ExitStack()
-    begins.callback(begin)  # once
+    recorder = recorder_of(rendering, journal, requested=rendering.requested)
 
     def keep(signals: dict[str, Any]) -> None:
         if len(signals["flags"]):
-            begins.close()
             recorder.append(**signals)
 
     device = rendering.device

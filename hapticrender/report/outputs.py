@@ -4,16 +4,15 @@ import errno
 import os
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from functools import partial
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from hapticrender.errors import PlateMismatch
 from hapticrender.formatting import as_json
 from hapticrender.loop import Progress, run
-from hapticrender.protocols import Rendering
+from hapticrender.protocols import Driver, Rendering
 from hapticrender.recordings.formats import MissingExtra, replacing, write_sound
 from hapticrender.recordings.journal import read_journal, refuse_others
 from hapticrender.recordings.recording import Recording
@@ -112,24 +111,31 @@ def naming_full(folder: str | Path) -> Iterator[None]:
 def run_to_end(folder: Path, rendering: Rendering, progress: Progress | None = None) -> Recording:
     """Run a prepared `rendering`, its journal in `folder`, which is made where it is not there.
 
-    Files of an earlier run are removed once the device has played: all files are then of this run, also after an
-    interruption.  A device that differs from its model is no error where warnings are.
+    Files of an earlier run are removed once the device is open and probed: all files are then of this run, also after
+    an interruption.  A device that differs from its model is no error where warnings are.
     """
     journal = folder / JOURNAL
-    try:
-        refuse_others(journal)
-    except ValueError:  # `refuse_to_overwrite` has refused it, but for --force
-        journal.unlink()
-    try:
-        begin = partial(begin_outputs, folder, rendering.scene)
-        return run(rendering, journal=journal, progress=progress, begin=begin)
-    except PlateMismatch as mismatch:
-        if mismatch.recording is None:
-            raise
-        with warnings.catch_warnings():
-            warnings.simplefilter("always")
-            warnings.warn(str(mismatch), PlateMismatch, stacklevel=2)
-        return mismatch.recording
+    with ExitStack() as at_end:
+
+        def begin(device: Driver) -> None:
+            if rendering.probe is not None:
+                rendering.probe(device)
+            at_end.callback(lambda: None if journal.exists() else remove_outputs(folder))
+            begin_outputs(folder, rendering.scene)
+
+        try:
+            refuse_others(journal)
+        except ValueError:  # `refuse_to_overwrite` has refused it, but for --force
+            journal.unlink()
+        try:
+            return run(replace(rendering, probe=begin), journal=journal, progress=progress)
+        except PlateMismatch as mismatch:
+            if mismatch.recording is None:
+                raise
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+                warnings.warn(str(mismatch), PlateMismatch, stacklevel=2)
+            return mismatch.recording
 
 
 def run_into(folder: Path, rendering: Rendering, *, progress: Progress | None = None) -> Outputs:
