@@ -180,13 +180,16 @@ def test_sensors_that_are_swapped_live_stop_the_drive_under_a_finger_off_the_mid
 
 @pytest.mark.parametrize("load", [0.8, 2.0])
 @pytest.mark.parametrize("frequency", [20.0, 72.0, 189.0, 400.0])
-def test_sensors_that_are_swapped_live_stop_the_drive_under_a_finger_on_the_middle(frequency, load):
-    """Their mean is the heave still; stopped before the levelling reaches its 1 N, 42 um at the ends beside 50."""
+def test_sensors_that_are_swapped_live_under_a_finger_on_the_middle_do_little(frequency, load):
+    """Their mean is the heave still, and each shows the true size of an end's motion.
+
+    So overmotion (3 R + 5.4 sag, 0.75 mm) bounds it as without the fault; seen are 94 um of 50, less than twice.
+    """
     plate = faults.FaultyWrongPlate(*faults.FAULTS["swapped"], load, 0.0)
-    named = pytest.raises(hr.DeviceFault, match="sensor 1 and 2: each shows the motion of the other")
-    with named, hr.Player(driver=plate, paced=False) as player:
+    with hr.Player(driver=plate, paced=False) as player:
         sleep_on(player, frequency)
-    assert moved_after(plate)[1] < 50e-6 + 42e-6
+        assert not player.state().flags & hr.Flag.STOPPED
+    assert moved_after(plate)[1] < 2 * 50e-6
 
 
 def test_a_device_that_is_unplugged_is_an_error_at_the_next_call():
