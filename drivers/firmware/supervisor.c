@@ -12,10 +12,6 @@
 #define SLOW_POWER REAL(0.65)
 #define SLOW_FORCE REAL(3.0)
 #define RINGING_STEP REAL(0.4)
-#define LEAST_TILTED REAL(0.85)
-#define MOST_TILTED REAL(1.2)
-#define LEAST_MOMENT REAL(0.1)
-#define UNEXPLAINED_MOMENT REAL(3e-3)
 #define MOTION_SAMPLES 5u
 
 void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const design_t *played)
@@ -314,34 +310,8 @@ static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
     return flags;
 }
 
-/* Test 11, slowly: whether the rocking force leaves a moment of -2 eta times its own, beside that of the finger. */
-static uint32_t check_tilt(supervisor_t *s, real_t position)
-{
-    const supervision_t *p = s->p;
-    const real_t *q = s->input;
-    const real_t place = isnan(position) ? REAL(0.0) : (s->design->lever_per_metre * position);
-    const real_t lever = real_clip(place, -p->lever, p->lever);
-    const real_t load = p->stiffness[0][0] * q[0] + p->stiffness[0][1] * q[1] - s->force[0];
-    const real_t moment = p->stiffness[1][0] * q[0] + p->stiffness[1][1] * q[1] - s->force[1] - lever * load;
-    for (uint32_t i = 0u; i < 2u; i++) {
-        mean(&s->tilt[i][0], p->tilt_low, (i == 0u) ? moment : (REAL(2.0) * s->force[1]));
-        mean(&s->tilt[i][1], p->tilt_low, s->tilt[i][0]);
-        mean(&s->tilt[i][2], p->tilt_high, s->tilt[i][1]);
-    }
-    const real_t left = s->tilt[0][1] - s->tilt[0][2];
-    const real_t drive = s->tilt[1][1] - s->tilt[1][2];
-    real_t *e = s->tilt_energy;
-    mean(&e[0], p->tilt_pole, left * left);
-    mean(&e[1], p->tilt_pole, -left * drive);
-    mean(&e[2], p->tilt_pole, drive * drive);
-    if (!(e[2] > LEAST_MOMENT * LEAST_MOMENT) || !(e[1] > LEAST_TILTED * e[2]) || !(e[1] < MOST_TILTED * e[2])) {
-        return 0u;
-    }
-    return (e[0] * e[2] - e[1] * e[1] < UNEXPLAINED_MOMENT * e[0] * e[2]) ? 1u : 0u;
-}
-
 /* Tests 9 to 11: whether a sensor or an actuator has changed its gain, or two are swapped. */
-static supervisor_cause_t compare_gains(supervisor_t *s, real_t position, supervisor_cause_t cause)
+static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
 {
     gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
@@ -350,7 +320,6 @@ static supervisor_cause_t compare_gains(supervisor_t *s, real_t position, superv
             found.swapped = 0u;
         }
     }
-    found.swapped |= check_tilt(s, position);
     if ((cause != SUPERVISOR_FINE) || ((found.sensors | found.swapped | found.actuators) == 0u)) {
         return cause;
     }
@@ -363,8 +332,7 @@ static supervisor_cause_t compare_gains(supervisor_t *s, real_t position, superv
 }
 
 /* All tests of a sample; returns what failed first. */
-static supervisor_cause_t check(
-    supervisor_t *s, law_t *law, const real_t sensed[], real_t position, const real_t drive[])
+static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[])
 {
     supervisor_cause_t cause = check_sensors(s, sensed, s->forces[s->at][2]);
     if ((check_drive(s, drive) != 0u) && (cause == SUPERVISOR_FINE)) {
@@ -389,7 +357,7 @@ static supervisor_cause_t check(
         cause = SUPERVISOR_RINGING;
     }
     if ((s->p->compared != 0u) && (s->cause == SUPERVISOR_FINE)) {
-        cause = compare_gains(s, position, cause);
+        cause = compare_gains(s, cause);
     }
     return cause;
 }
@@ -409,7 +377,7 @@ uint32_t supervisor_step(
         s->input[2u + i] = REAL(0.5) * (s->force[i] + s->forces[s->at][i]);
         s->force[i] = s->forces[s->at][i];
     }
-    const supervisor_cause_t cause = check(s, law, sensed, position, drive);
+    const supervisor_cause_t cause = check(s, law, sensed, drive);
     s->cause = (s->cause == SUPERVISOR_FINE) ? cause : s->cause;
     if (s->cause != SUPERVISOR_FINE) {
         s->fade_step = real_max(s->fade_step, (cause == SUPERVISOR_OVERMOTION) ? s->p->fade_now : s->p->fade_out);

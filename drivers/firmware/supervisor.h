@@ -32,7 +32,6 @@ typedef struct {
     real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
     real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
     real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_now;
-    real_t tilt_low, tilt_high, tilt_pole;
     uint32_t invalid_time, frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time;
     uint32_t ring_stop_time, suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */
@@ -63,7 +62,7 @@ typedef struct {
     real_t forces[LAW_DELAY + 1][3]; /* N, N, A: forces and sum of the drive on their way */
     real_t force[2], input[4];
     real_t energy[12];               /* means of squares of q, v, a, dF, F, r in both coordinates */
-    real_t power[2], ring_energy[2], slow[4], tilt[2][3], tilt_energy[3];
+    real_t power[2], ring_energy[2], slow[4];
     real_t drive_energy[LAW_CHANNELS], heat[LAW_CHANNELS];
     real_t last[LAW_SENSORS], least[LAW_SENSORS], most[LAW_SENSORS];
     real_t fade, fade_step, invalid, peak;

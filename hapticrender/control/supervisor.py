@@ -50,7 +50,6 @@ RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
-TILT_TIMES = 10e-3, 0.1, 60e-3  # s: low-pass, high-pass, mean; about the 50 ms in which a device is levelled
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
 FRICTION_TIME, FRICTION_SIGMAS = 20e-3, 20.0  # s, of the mean friction; of the noise: a smaller one is not judged
 DANGER_DRIVE = 0.9  # of the drive limit
@@ -183,6 +182,7 @@ class SupervisedController(Addressed):
     def unplayed(self, samples: Array) -> None:
         """Compare motion with no drive where that which acts so many samples from now on was not played."""
         self._forces[(self.state["now"] + samples) % len(self._forces)] = 0.0
+        self.state["friction"] = 0.0  # what is sensed next may be later than a sample
 
     run = BankController.run
 
@@ -324,8 +324,6 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "most_motion": 3.0 * demand.motion + 5.4 * sag,
         "slow_pole": _pole(SLOW_MEAN, rate),
         "slow_time": SLOW_TIME * rate,
-        **{f"tilt_{name}": _pole(t, rate) for name, t in zip(("low", "high", "pole"), TILT_TIMES, strict=True)},
-        "lever_per_metre": model.lever_per_metre,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
 
