@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 from electroadhesive import Screen
+from scipy.signal import step
 from test_ultrasonic_rendering import watched
 
 import hapticrender as hr
+from hapticrender.control.supervisor_kernel import JUMP_NEIGHBOURS
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 
@@ -119,6 +121,19 @@ def test_no_finger_makes_a_tribometer_jump(leak, block):
         hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=1.0), driver=device
     )
     assert not (recording.flags & hr.Flag.STOPPED).any()
+
+
+@pytest.mark.parametrize("damping", [0.44, 0.65, 1.0])
+def test_a_mass_shows_no_step_alone(damping):
+    """Its largest step between samples has a large one beside it, at any phase; test 12 needs less."""
+    omega, ratios = 2 * np.pi * 1300.0, []
+    time = np.arange(4000) * 2 * damping / omega / 200  # parts of the longest sample for which test 12 is designed
+    shown = step(([omega**2], [1.0, 2 * damping * omega, omega**2]), T=time)[1]
+    for phase in range(200):
+        steps = abs(np.diff(np.r_[0.0, 0.0, shown[phase::200]]))
+        largest_at = steps.argmax()
+        ratios.append(steps[[largest_at - 1, largest_at + 1]].max() / steps[largest_at])
+    assert min(ratios) > JUMP_NEIGHBOURS
 
 
 @pytest.mark.parametrize("hold", [2, 10])

@@ -5,6 +5,7 @@ import doctest
 import graphlib
 import importlib
 import inspect
+import os
 import pkgutil
 import re
 import subprocess
@@ -77,11 +78,9 @@ def test_sweep_is_a_module_before_and_after_its_import():
     subprocess.run([sys.executable, "-c", script + "; assert before.sweep"], check=True, cwd=ROOT)
 
 
-def test_every_name_that_type_checkers_see_is_there():
-    imported = [node for node in tree_of(ROOT / "hapticrender/__init__.pyi").body if isinstance(node, ast.ImportFrom)]
-    seen = {alias.asname for node in imported for alias in node.names}
-    assert seen == {*hapticrender.__all__, "sweep"}
-    assert all(hasattr(hapticrender, name) for name in seen)
+def test_type_checkers_see_every_public_name():
+    (block,) = [node for node in tree_of(MODULES["hapticrender"]).body if is_for_types_only(node)]
+    assert sorted(alias.asname for node in block.body for alias in node.names) == hapticrender.__all__
 
 
 GROUND = {
@@ -118,7 +117,7 @@ def layer_of(name):
 
 
 def is_for_types_only(node):
-    return isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    return isinstance(node, ast.If) and ast.unparse(node.test) in ("TYPE_CHECKING", "_typing.TYPE_CHECKING")
 
 
 def imports(node, at_once=False):
@@ -386,3 +385,16 @@ def test_every_test_that_the_page_on_safety_names_is_there():
         elif word.startswith("..._"):
             pattern = re.escape(word).replace(re.escape("..."), ".*")
             assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
+
+
+@pytest.mark.parametrize(
+    ("there", "status", "said"), [({}, 0, "skipped"), ({"HAPTICRENDER_PACKAGES": "there"}, 1, "failed")]
+)
+def test_what_is_skipped_for_want_of_a_package_fails_where_all_are_there(there, status, said):
+    """As in `.ci/run`; here no program at all is found."""
+    environment = {name: value for name, value in os.environ.items() if name != "HAPTICRENDER_PACKAGES"}
+    command = [sys.executable, "-m", "pytest", "-q", "-k", "memory_of_a_board", ROOT / "tests" / "test_firmware_m4.py"]
+    options = {"env": environment | there | {"PATH": ""}, "cwd": ROOT, "capture_output": True, "text": True}
+    done = subprocess.run(command, **options, check=False)
+    assert done.returncode == status, done.stdout
+    assert f" {said}, " in done.stdout

@@ -109,7 +109,8 @@ def test_a_plate_that_the_application_has_opened_is_left_at_zero_drive_by_identi
     assert not plate.played[-1].any()
 
 
-@pytest.mark.parametrize(("verb", "name", "status"), [("identify", "INT", 130), ("latency", "TERM", 143)])
+@pytest.mark.parametrize("verb", ["identify", "latency"])
+@pytest.mark.parametrize(("name", "status"), [("INT", 130), ("TERM", 143), ("HUP", 129)])
 def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tmp_path):
     """With the exit status that every verb has, also where the signal comes again while it closes the driver."""
     log = tmp_path / "played"
@@ -144,7 +145,8 @@ signal.raise_signal(int(sys.argv[3]))
 """
 
 
-@pytest.mark.parametrize(("work", "name", "status"), [("render", "SIGINT", -signal.SIGINT), ("player", "SIGTERM", 143)])
+@pytest.mark.parametrize("work", ["render", "player"])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", -signal.SIGINT), ("SIGTERM", 143)])
 def test_a_run_in_a_daemon_thread_ends_at_zero_drive_with_the_program(work, name, status, tmp_path):
     """By Ctrl-C, or by SIGTERM where the application raises an exception, as docs/live.md says."""
     log = tmp_path / "played"

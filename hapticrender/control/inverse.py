@@ -260,7 +260,8 @@ def before_contact(model: DeviceModel) -> dict[str, Array]:
 
 def contact_length(model: DeviceModel) -> float:
     """Length (m) by which a sliding contact lags behind the drive, or behind the sensors where they precede it."""
-    return model.contact_lag or float(model.contact_damping / model.stiffness[0, 0])
+    behind = model.contact_damping > 0.0
+    return float(model.contact_damping / model.stiffness[0, 0]) if behind else model.contact_lag
 
 
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:

@@ -48,7 +48,7 @@ from hapticrender.touch.finger import Finger
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
 UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
 RAMP = 0.05  # s: fade-in and fade-out of the drive
-SETTLED = 0.25  # s: least time from the first motion to the record
+LEAST_WAIT = 0.25  # s: least time from the first motion to the record
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
@@ -268,7 +268,7 @@ def identify(
         return found.shortened(getattr(made, "host_delay", 0))
     rate = float(driver.rate)
     samples = _samples(driver, parameters, seconds, wait)
-    wait = max(wait, driver.delay / rate + SETTLED)
+    wait = max(wait, driver.delay / rate + LEAST_WAIT)
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
     if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
