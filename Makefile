@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-live test-rest packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
+.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -12,7 +12,7 @@ RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
-# Tests that play in real time run one after the other; the rest on two cores.
+# Tests that play in real time run first, one after the other; the rest on two cores.
 REAL_TIME := tests/test_audio_jack.py tests/test_audio_verbs.py $(wildcard tests/test_player*.py) tests/test_board_live.py
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
@@ -26,12 +26,8 @@ help: ## list the verbs
 demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into out/demo
 	@.venv/bin/hapticrender demo --out $(OUT)
 
-test: test-live test-rest ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
-
-test-live: .venv/test.stamp
+test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
 	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
-
-test-rest: .venv/test.stamp
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
