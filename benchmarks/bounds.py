@@ -1,4 +1,4 @@
-"""Bounds of figures that README states as missed: what physics and late reports leave, with no error of a law.
+"""Bounds of figures that docs/figures.md states as missed: what physics and late reports leave, with no error of a law.
 
 Run: python -m benchmarks.bounds
 

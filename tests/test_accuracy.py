@@ -15,7 +15,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.touch.mechanics import FingerMechanics
 
-MISSES = {  # bounds that the default method misses: each is in README's table, or within its last digit there
+MISSES = {  # bounds that the default method misses: each is in docs/figures.md, or within its last digit there
     "white wrong": {"slide, end"},
     "comb": {"first"},
     "comb bent": {"first"},
