@@ -1,4 +1,4 @@
-"""Figures of docs/figures.md, on a plate that shares no code with the library: what must be reached is, by the accuracy suite.
+"""Figures of docs/figures.md, on a plate that shares no code with the library: by the accuracy suite.
 
 Rows that take longer are in ``hapticrender validate --suite accuracy --driver tests.strangers_plate:plate`` alone.
 """
