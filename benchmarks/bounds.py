@@ -1,16 +1,20 @@
-"""Bounds of figures that docs/figures.md states as missed: what physics and late reports leave, with no error of a law.
+"""What is left of figures that docs/figures.md states as missed where one thing alone is wrong.
 
 Run: python -m benchmarks.bounds
 
-1. Glass that bends while both ends follow the texture r exactly: ``theta = 0, x_c = r - e``.  The coils' force F, which
-   acts on the mode with its shape c there, and a finger of dynamic stiffness D_f at p, where the shape is phi, leave
-   ``y - r = (phi - 1) e`` under the finger, with D_0 and D_b the dynamic stiffness of heave and of the mode::
+1. Glass that bends.  One force F moves heave x_c and the mode e, so what the place under a finger and the ends differ
+   by, ``(1 - phi) e``, is the same for every law to first order: no law is below it at both together.  With
+   ``x_c = r - s e`` (s = 1: both ends follow the texture r exactly, as sensors there make a law that learns do;
+   s = 0: heave is that of the exactly known rigid plate), D_0 and D_b the dynamic stiffness of heave and mode, c the
+   mode's shape at the coils, and a finger of dynamic stiffness D_f at p, where the shape is phi::
 
-       F = D_0 (r - e) + D_f y,   D_b e = c F - phi D_f y
+       F = D_0 (r - s e) + D_f y,   D_b e = c F - phi D_f y,   y = r + (phi - s) e
 
 2. The comb's first half second: 0.8 N within a sample on the damped plate; its sag rings, and nothing else is wrong.
+   A law that compensated the sag would leave less.
 3. Touch and lift: an exact inverse, the wrong one (of the plate before) until `late` after the contact or its end, and
-   a damper on the error all the while.  Sags are not compensated.
+   a damper on the error all the while.  Sags are not compensated: a law that did, or fed back more than a damper,
+   would leave less; without a load most of it is gone.
 4. A target of 0.1 um whose amplitude is learned from N = 400 s of two sensors with noise sigma = 1 um alone: the
    Cramer-Rao bound ``sigma sqrt(2/N)/sqrt(2)``.
 """
@@ -36,23 +40,27 @@ LINES = np.arange(20.0, 401.0, 20.0)  # Hz
 WHITE, SWEPT = np.arange(20.0, 400.5), np.arange(30.0, 390.5)  # Hz
 
 
-def bent(frequency: Array, finger: FingerMechanics, position: Array) -> Array:
-    """Error under the finger over the texture (complex, shape (positions, frequencies)) while both ends are exact."""
+def bent(frequency: Array, finger: FingerMechanics, position: Array, share: float = 1.0) -> tuple[Array, Array]:
+    """Errors over the texture (complex, shape (positions, frequencies)) under the finger and at the ends.
+
+    `share` is s: 1 where both ends are exact, 0 where heave is.
+    """
     mode, omega = 2 * np.pi * BENT.bending_frequency, 2 * np.pi * frequency
     heave, coil = BENT.dynamic_stiffness(frequency)[:, 0, 0], BENT.bending_coil
     bend = BENT.bending_mass * (mode**2 - omega**2 + 2j * BENT.bending_damping * mode * omega)
     tissue, shape = 1j * omega * finger.impedance(frequency), BENT.displacement(position)[:, 2:]
     forced = coil * heave + (coil - shape) * tissue
-    return np.asarray((shape - 1) * forced / (bend + coil * heave - (coil - shape) * (shape - 1) * tissue))
+    moved = forced / (bend + share * coil * heave - (coil - shape) * (shape - share) * tissue)
+    return (shape - share) * moved, (1 - share) * moved
 
 
-def bent_figures(finger: FingerMechanics) -> tuple[float, float, float, float]:
-    """Worst tone (amplitude, rms over a slide), white noise, comb, and sweep (in the middle), over the texture."""
+def bent_figures(finger: FingerMechanics, share: float) -> tuple[Array, Array, Array, float]:
+    """Worst tone (amplitude, rms over a slide), white noise, and comb, under the finger and at the ends; sweep."""
     position = sliding(np.arange(0.0, 1.0, 1e-3))
-    tones = rms(amplitude_error(1 + bent(np.array(FREQUENCIES), finger, position), 1.0))
-    white, comb = (float(rms(bent(each, finger, position), (0, 1))) for each in (WHITE, LINES))
-    sweep = rms(amplitude_error(1 + bent(SWEPT, finger, np.zeros(1)), 1.0), (0, 1))
-    return float(tones.max()), white, comb, float(sweep)
+    tones = [rms(amplitude_error(1 + each, 1.0)).max() for each in bent(np.array(FREQUENCIES), finger, position, share)]
+    white, comb = (rms(np.array(bent(each, finger, position, share)), (1, 2)) for each in (WHITE, LINES))
+    sweep = rms(amplitude_error(1 + bent(SWEPT, finger, np.zeros(1), share)[0], 1.0), (0, 1))
+    return np.array(tones), white, comb, float(sweep)
 
 
 class DampedPlate:
@@ -140,11 +148,12 @@ def touch_figures(late: float, loaded: bool = True, seed: int = 1) -> tuple[floa
 
 
 def main() -> None:
-    """Print every bound."""
-    for name, finger in (("free", NONE), ("heavy finger", HEAVY)):
-        tone, white, comb, sweep = bent_figures(finger)
-        figures = f"tones {tone:.2%}, white noise {white:.2%}, comb {20 * np.log10(comb):.1f} dB, sweeps {sweep:.2%}"
-        print(f"bent glass, {name}: {figures}")
+    """Print what each leaves."""
+    for (name, finger), share in product((("free", NONE), ("heavy finger", HEAVY)), (1.0, 0.0)):
+        *pairs, sweep = bent_figures(finger, share)
+        tone, white, comb = (f"{at:.2%} / {end:.2%}" for at, end in pairs)
+        print(f"bent glass, exact {'ends' if share else 'heave'}, {name}, under the finger / at the ends:")
+        print(f"    tones {tone}, white noise {white}, comb {comb}, sweeps {sweep:.2%}")
     turn = float(sliding(np.array(1.0)))  # where the suite's finger touches
     for place, quality in product((turn, 0.0), (DAMPED, (1.0, 1.0))):
         first = 20 * np.log10(sag_figure(place, quality))

@@ -17,9 +17,13 @@ from hapticrender.touch.mechanics import FingerMechanics
 
 MISSES = {  # bounds that the default method misses: each is in docs/figures.md, or within its last digit there
     "white wrong": {"slide, end"},
+    "white modes": {"free", "slide"},
+    "tones bent": {"finger"},
     "comb": {"first"},
-    "comb bent": {"first"},
+    "comb bent": {"finger", "first"},
     "sweeps": {"400 Hz/s"},
+    "sweeps bent": {"200 Hz/s", "400 Hz/s", "800 Hz/s"},
+    "touch modes": {"centre"},
     "touch 10 um": {"centre", "end"},
 }
 RANGES = ((1e-4, 5e-4), (0.5, 12.0), (400.0, 12e3), (1e-3, 10e-3), (0.3, 4.0), (60.0, 900.0))  # skin, then phalanx
