@@ -399,7 +399,7 @@ class Player(Addressed):
                 loop.silence()
             with suppress(Exception):
                 if not self._clocked:
-                    play_zeros(loop.driver)
+                    play_zeros(loop.rendering.device)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
 
