@@ -1,5 +1,6 @@
 """What fails in live play on screens, ultrasonic surfaces and hybrids: the drive of the device itself is zero."""
 
+import copy
 import signal
 import time
 
@@ -22,6 +23,34 @@ KINDS = {
     "ultrasonic": lambda: watched(FINGER),
     "hybrid": bench,
 }
+
+
+class Queued(Screen):
+    """A screen like a sound card: `play` is three blocks later than a callback, for which `live` makes the driver."""
+
+    def __init__(self):
+        super().__init__(blind=False, block=26, finger=FINGER, rate=20_000.0)
+        self.delay, self.waiting = 4 * self.block, [np.zeros((self.block, 1))] * 3
+
+    def _play(self, drive):
+        self.waiting.append(drive.copy())
+        return super()._play(self.waiting.pop(0))
+
+    def live(self):
+        live = copy.copy(self)
+        live.delay = self.block
+        return live
+
+
+def test_a_screen_on_a_card_is_designed_for_the_delay_of_play():
+    """As for `render`: designed for that of the callback, which it has not, the loop was off by 1.8 to 3 times."""
+    with hr.Player("electroadhesion", Queued(), paced=False) as player:
+        player.finger(-0.03, 0.08, 0.4)
+        player.play(TEXTURE)
+        slide(player, 0.8, start=-0.03, speed=0.08)
+        [band] = player.state().bands
+        assert player._loop.model.delay == 4 * 26
+    assert band.error < 0.05
 
 
 def unplug(sensed):
