@@ -354,7 +354,10 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
             if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
                 raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
             if raised & Flag.OVERRUN:
-                cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and sound server)"
+                cure = (
+                    "free the computer; take larger blocks of a sound card (--driver 'audio:NAME?block=1024', and of "
+                )
+                cure += "its server), or a faster line to a board ('serial:PORT?baud=921600', or USB)"
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
