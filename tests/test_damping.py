@@ -179,7 +179,7 @@ def test_quality_is_the_least_that_keeps_the_bounds(rate, delay, quality):
 
 @pytest.mark.parametrize(("rate", "coil", "quality"), [(5000, -0.1, 1.5), (5000, 0.1, 1.9), (20000, -0.1, 1.4)])
 def test_a_measured_mode_lets_the_quality_down(rate, coil, quality):
-    chosen = choose_damping(model_of(rate), bending=bending(coil))
+    chosen = choose_damping(replace(model_of(rate), bending=bending(coil)))
     assert chosen.quality == quality
     for frequency in (1050.0, 1100.0, 1150.0, 1200.0, 1250.0):
         assert holds(chosen.taps[HEAVE], rate, 1, bending(coil, frequency))
@@ -187,8 +187,8 @@ def test_a_measured_mode_lets_the_quality_down(rate, coil, quality):
 
 def test_a_coordinate_with_a_design_of_its_own_may_have_more_taps_than_the_notched_one():
     """Eight plain taps beside the five that spare the bending mode: both are padded with zeros, the other one stays."""
-    model, mode = replace(model_of(5000), taps=8), bending(-0.1, 2000.0)
-    whole, own = choose_damping(model, bending=mode), choose_damping(model, bending=mode, apart=True)
+    model = replace(model_of(5000), taps=8, bending=bending(-0.1, 2000.0))
+    whole, own = choose_damping(model), choose_damping(model, apart=True)
     assert whole.taps.shape[1] < own.taps.shape[1] == 8
     np.testing.assert_array_equal(own.taps[HEAVE, : whole.taps.shape[1]], whole.taps[HEAVE])
     assert not own.taps[HEAVE, whole.taps.shape[1] :].any()

@@ -117,7 +117,7 @@ def design_controller(
     refuse_whole_waveform(bands)
     rules = rules.scaled(model.pace)
     by_sample = model.delay <= MOST_DAMPER_DELAY
-    damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and by_sample else None
+    damping = choose_damping(model) if any(rules.damper) and feedback and by_sample else None
     if damping is None or not damping.on:
         rules = replace(rules, damper=(0.0, 0.0))
     elif model.always_damped:

@@ -174,7 +174,7 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, apart: bool = False) -> Damping:
+def choose_damping(model: DeviceModel, *, apart: bool = False) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none.
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
@@ -187,7 +187,8 @@ def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, ap
     """
     if not (model.mass.diagonal() > 0.0).all():
         return _off(len(model.mass))
-    known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
+    bending, parts = model.bending, oscillators(model)
+    known = model.rigid if bending is None else bending.measured
     plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
     least = QUALITY if known else QUALITY_UNMEASURED
     if not apart:

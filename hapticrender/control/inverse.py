@@ -185,7 +185,7 @@ class AdaptiveInverse:
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
-        damping = choose_damping(model, bending=model.bending, apart=True) if feedback else None
+        damping = choose_damping(model, apart=True) if feedback else None
         if damping is not None and not (damping.on and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
