@@ -31,7 +31,7 @@ _HOMES = {
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
     "ProtocolError SceneError WatchdogTimeout",
     "loop": "prepare render run",
-    "plants.identify": "Identified compare identify",
+    "plants.identify": "Identified identify",
     "player": "Player",
     "protocols": "Controller Driver Flag Method Motion Plant Renderer Rendering Sensed Texture",
     "recordings.recording": "Recorder Recording",
@@ -78,7 +78,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.loop import render as render
     from hapticrender.loop import run as run
     from hapticrender.plants.identify import Identified as Identified
-    from hapticrender.plants.identify import compare as compare
     from hapticrender.plants.identify import identify as identify
     from hapticrender.player import Player as Player
     from hapticrender.protocols import Controller as Controller

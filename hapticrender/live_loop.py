@@ -123,6 +123,8 @@ class LiveLoop(RealtimeEntry):
         `late`: the device was left behind by the clock before it.
         """
         places, stated = len(self.model.places), self._has_motion
+        if hasattr(self.driver, "resting"):
+            self.driver.resting = self.stopped is not None or not self._slot["playing"][0]
         sensed = check_sensed(self.driver, self.driver.play(self._drive), places, stated)
         at = (self.samples + np.arange(self.driver.block)) % len(self._true)
         if sensed.motion is not None:

@@ -335,7 +335,10 @@ class _Loop:
 
     def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
         """Exchange a block with the driver; the drive computed from it is played with the next one."""
-        driver, played = self.rendering.driver, self._drive
+        driver: Any = self.rendering.driver
+        played = self._drive
+        if hasattr(driver, "resting"):
+            driver.resting = self._stopped >= 0
         places = len(self.rendering.model.places)
         sensed = check_sensed(driver, driver.play(played.copy()), places, self._has_motion)
         self._has_motion = sensed.motion is not None

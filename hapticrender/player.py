@@ -339,12 +339,14 @@ class Player(Addressed):
 
     def _begin(self, scenes: list[Scene]) -> list[Rendering]:
         """Make the driver, start the device with the first scene's texture, and prepare those of the others."""
-        driver: Any = self._driver
-        if isinstance(driver, str):
-            driver = open_driver(driver, scenes[0].device_profile)
-        driver = driver.live() if hasattr(driver, "live") else driver
+        given = self._driver
+        driver: Any = open_driver(given, scenes[0].device_profile) if isinstance(given, str) else given
+        live = driver.live() if hasattr(driver, "live") else driver
         try:
-            return self._start(prepare(scenes[0], driver=driver), scenes[1:])
+            rendering = prepare(scenes[0], driver=live)
+            if live is not driver and rendering.driver is not live:  # which a thread plays, later than a callback
+                rendering = prepare(scenes[0], driver=driver)
+            return self._start(rendering, scenes[1:])
         except BaseException as error:
             with noted_on(error), self._stack:  # what has been opened is left at rest
                 self._loop = None
@@ -399,7 +401,7 @@ class Player(Addressed):
                 loop.silence()
             with suppress(Exception):
                 if not self._clocked:
-                    play_zeros(loop.driver)
+                    play_zeros(loop.rendering.device)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
 

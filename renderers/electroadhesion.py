@@ -9,7 +9,7 @@ from voltage and current, or nothing.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hapticrender.checks import inside, option, parameter, require
+from hapticrender.checks import inside, option, parameter
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
@@ -88,8 +88,6 @@ class ElectroadhesionRenderer(FrictionRenderer):
         check_tables(scene, ElectroadhesionParameters.names(), ElectroadhesionSettings.names(), LEVEL)
         with inside("render"):
             settings = ElectroadhesionSettings(**scene.rendering)
-        moved = scene.device_profile.limits.displacement
-        require(moved is None, "limits.displacement", moved, "left out: a screen senses no displacement")
         return ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:

@@ -194,6 +194,8 @@ class FrictionRenderer(BaseRenderer):
 
     def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
         """Return `model`: its drive is a friction, and the setup has the limits of the carrier; see `carrier_limit`."""
+        bound = "left out: it bounds the sensors of plates; of a screen or an ultrasonic surface limit the drive"
+        require(limits.displacement is None, "limits.displacement", limits.displacement, bound)
         return model
 
     def waveform(self, setup: FrictionSetup, texture: Texture) -> Waveform:

@@ -74,7 +74,7 @@ class HybridDriver(WrappedDriver):
         """Play a block, the screen's drive as a current."""
         drive = np.array(drive, float)
         drive[:, COILS] = self.shape(drive[:, COILS])
-        sensed = self.driver.play(drive)
+        sensed = self.put(drive)
         if sensed.motion is not None or not self.sensed_channels:
             return sensed
         with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag

@@ -133,7 +133,7 @@ class ResonantDriver(WrappedDriver):
         for start in range(0, len(target), step):
             at = start % long
             if at == 0:
-                played.append(check_sensed(self.driver, self.driver.play(self._drive), 1))
+                played.append(check_sensed(self.driver, self.put(self._drive), 1))
             here = slice(at, at + step)
             sensed = played[-1].sensed[here] if self.sensed_channels else silent
             self._next[here], _, raised = self._supervised.run(sensed, away, target[start : start + step])

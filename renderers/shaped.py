@@ -8,6 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from hapticrender.checks import require
+from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.protocols import Array, Driver, Sensed
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
@@ -26,14 +27,29 @@ class Port:
 
 
 class WrappedDriver:
-    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`."""
+    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`, by `put`.
+
+    While `resting` the device's own drive fades to zero: what zero drive of the controller becomes may be a bias.
+    """
 
     motion_source = "true"  # of the motion that `play` returns, where it does
+    resting = False  # set by the loop from a stop on
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
         self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay
         self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
+        self._level = 1.0  # factor on the device's drive
+
+    def put(self, drive: Array) -> Sensed:
+        """Play a block of the device's own drive."""
+        if not self.resting:
+            self._level = 1.0
+            return self.driver.play(drive)
+        fade = np.arange(1, len(drive) + 1) / (FADE_OUT * self.driver.rate)
+        level = np.maximum(self._level - fade, 0.0)
+        self._level = float(level[-1])
+        return self.driver.play(level[:, None] * drive)
 
     def __enter__(self) -> Self:
         self.driver.__enter__()
@@ -64,7 +80,7 @@ class ShapedDriver(WrappedDriver):
 
     def play(self, drive: Array) -> Sensed:
         """Play `shape` of a block."""
-        sensed = self.driver.play(self.shape(drive))
+        sensed = self.put(self.shape(drive))
         motion = None if sensed.motion is None else np.abs(sensed.motion)
         return sensed._replace(sensed=np.abs(sensed.sensed), motion=motion)
 
@@ -99,5 +115,5 @@ class CarrierDriver(ShapedDriver):
         count = len(drive) * self.hold
         carrier = np.cos(2 * np.pi * (self._turns + self._step * np.arange(count))) / self._droop
         self._turns = (self._turns + self._step * count) % 1.0
-        sensed = self.driver.play(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
+        sensed = self.put(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
         return thinned(sensed, self.hold)

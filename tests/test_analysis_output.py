@@ -1,7 +1,6 @@
 """The verb `finger`: what it prints, writes and refuses; its pictures and page show the record's own numbers."""
 
 import json
-import re
 import sys
 from dataclasses import replace
 
@@ -13,7 +12,6 @@ from test_page import Reader
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.analysis import output, pictures
-from hapticrender.analysis.load_law import LoadLaw, mean_exponent
 from hapticrender.analysis.records import LOADED, Impedance
 from hapticrender.touch.mechanics import LIGHT
 
@@ -124,18 +122,6 @@ def test_a_folder_has_every_picture_and_a_page_of_them(record, tmp_path):
     assert f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" in text
 
 
-def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
-    one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
-    apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
-    missing = replace(one, exponent=np.array([np.nan]))
-    (mean,), (error,), _ = mean_exponent([one, near, missing], np.array([101.0]))
-    assert (mean, error) == pytest.approx((0.1, 0.2 / np.sqrt(5)))  # weights 100 and 25
-    (mean,), (error,), _ = mean_exponent([one, apart], np.array([101.0]))
-    assert mean == pytest.approx((100 * 0.1 + 25 * 1.1) / 125)
-    assert error == pytest.approx(np.sqrt((100 * 0.2**2 + 25 * 0.8**2) / 125))
-    assert np.isnan(mean_exponent([one], np.array([200.0]))).all()
-
-
 def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     z, nothing = record.impedance, np.full(len(record.time), np.nan)
     masked = Impedance(z.time, z.frequency, z.value * np.nan, z.standard_error * np.nan, 0 * z.normal_load, z.position)
@@ -143,7 +129,8 @@ def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     lifted = replace(record, impedance=masked, position=empty, velocity=empty, contact=0 * record.contact, segments=())
     shown, text = parsed(pictures.draw(lifted, tmp_path))
     assert shown == ["time-1.png"]
-    assert re.search(r"Loaded</dt><dd>0\.00 of 4\.\d\d s, 0 touches", text)
+    assert "se: standard error of one sample" not in text, "it lists no touch"
+    assert "position is good to 1 mm" in text
 
 
 def test_without_matplotlib_there_is_a_page_and_a_warning(record, tmp_path, monkeypatch):

@@ -265,7 +265,7 @@ def test_only_counters_wrap(tmp_path):
 
 
 def test_what_is_no_array_and_what_lies_elsewhere_is_no_reason_to_refuse_a_file(tmp_path):
-    """A note in an NPZ file, and a virtual data set of an HDF5 file; a recording of our own may have neither."""
+    """A note in an NPZ file, and a virtual data set of an HDF5 file."""
     path = tmp_path / "a.npz"
     np.savez(path, x=np.arange(4.0))
     with zipfile.ZipFile(path, "a") as file:

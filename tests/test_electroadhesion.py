@@ -85,7 +85,7 @@ def twin(parameters, envelope, load):
         ends = start + h * np.arange(1, p.oversampling + 1)
         with np.errstate(under="ignore"):  # the solver looks for the least step after t = 0
             solved = solve_ivp(
-                lambda t, q, amplitude=amplitude: amplitude * np.cos(w * t) + p.current_offset - q / tau,
+                lambda t, q, amplitude=amplitude: amplitude * np.cos(w * t) - q / tau,
                 (start, ends[-1]),
                 charge,
                 t_eval=ends,
@@ -101,40 +101,11 @@ def twin(parameters, envelope, load):
 def test_the_circuit_is_integrated_exactly(leak, rng):
     """Against a twin with 1e-9 of charge a step of some hundred, twice that of force; friction's lag is undone."""
     envelope = 6e-3 * rng.random(30)
-    p = ElectroadhesionParameters(
-        level="carrier", gap_resistance=leak, current_offset=5e-6, servo_conductance=0.0, unevenness=1.3, **STRONG
-    )
+    p = ElectroadhesionParameters(level="carrier", gap_resistance=leak, unevenness=1.3, **STRONG)
     played = ElectroadhesionScreen(p, SLIDE).run(np.r_[envelope, 0.0][:, None])
     kept = np.exp(-0.05 / (RATE * p.memory_length))
     steady = (played.motion[1:, 0] - kept * played.motion[:-1, 0]) / (1 - kept)
     np.testing.assert_allclose(steady / MU - 1.0, twin(p, envelope, 1.0), rtol=2e-7, atol=SUMMED)
-
-
-def insulator_voltage(servo, seconds, offset=1e-6):
-    """Direct voltage of 0.9 nF under a leaking current source, every 10 ms."""
-    s = screen(
-        level="carrier",
-        current_offset=offset,
-        servo_conductance=servo,
-        area_scale=ONE_CM2,
-        insulator_capacitance=0.9e-5,
-        **STRONG,
-    )
-    voltage = []
-    for _ in range(round(seconds * 100)):
-        s.run(np.full((100, 1), 6e-3))
-        voltage.append(s.state["charge"][0, 0] / 0.9e-9)
-    return np.array(voltage)
-
-
-def test_offset_charges_the_capacitors_without_a_servo_and_stops_with_it():
-    """1 uA into 0.9 nF is 1.1 kV/s; the servo holds offset/conductance = 10 V."""
-    rise = insulator_voltage(0.0, 0.2)
-    np.testing.assert_allclose(np.diff(rise) * 100, 1e-6 / 0.9e-9, rtol=1e-5)
-    held = insulator_voltage(1e-7, 0.3)
-    assert held.max() < 10.0 * (1 + 1e-6)
-    assert held[-1] == pytest.approx(10.0, rel=1e-4)  # exp(-0.3 s 1e-7 S/0.9 nF)
-    assert abs(insulator_voltage(0.0, 0.2, offset=0.0)).max() < 1e-6  # starts at its crest: no charge stays
 
 
 @LEVELS

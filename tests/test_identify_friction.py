@@ -114,8 +114,8 @@ def test_too_short_a_slide_is_refused_since_its_intervals_would_be_none():
         (Resonator(unit=0.0), "sensed no motion at any line of the drive: check the sensor's connection"),
         (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
         (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
-        (Resonator(unit=1e6), r"sensed 1\.\d+ m: must be <= 2.5e-05 m, .* is it in m"),
-        (Screen(unit=1e3), r"sensed \d+ N: must be <= 20 N, .* is it in N"),
+        (Resonator(unit=1e6), r"sensor 1: \S+ m at sample \d+: must be within \+-2.5e-05 m; check its unit"),
+        (Screen(unit=1e3), r"sensor 1: \S+ N at sample \d+: must be within \+-20 N; check its unit"),
     ],
 )
 def test_what_cannot_be_identified_or_used_is_refused(device, message):

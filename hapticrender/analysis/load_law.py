@@ -102,27 +102,6 @@ def load_exponent(impedance: Source | Sequence[Source]) -> LoadLaw:
     return LoadLaw(*(np.array(column) for column in columns))
 
 
-def mean_exponent(laws: Sequence[LoadLaw], frequency: Array) -> tuple[Array, Array, Array]:
-    """Weighted mean of the exponents of several recordings at each frequency (Hz), its error, and the mean R^2.
-
-    NaN where no recording has an exponent.
-    """
-    found = []
-    for at in frequency:
-        own = [np.isfinite(law.exponent) & (np.abs(np.log(law.frequency / at)) < BAND) for law in laws]
-        names = "exponent", "standard_error", "determination"
-        rows = [[getattr(law, name)[mine] for name in names] for law, mine in zip(laws, own, strict=True)]
-        n, error, share = np.concatenate(rows, axis=1)
-        if not n.size:
-            found.append((nan, nan, nan))
-            continue
-        mean = np.average(n, weights=error**-2)
-        scatter = max(1.0, np.sum(((n - mean) / error) ** 2) / max(len(n) - 1, 1))
-        found.append((mean, np.sqrt(scatter / np.sum(error**-2)), share.mean()))
-    means, errors, shares = np.array(found).reshape(-1, 3).T
-    return means, errors, shares
-
-
 def _power(samples: Samples) -> tuple[float, ...]:
     """One row of `LoadLaw` from the samples of a bin."""
     logs, sigma = np.log(samples.load), samples.standard_error

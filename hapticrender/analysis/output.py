@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import load_exponent, mean_exponent, weighted_mean
+from hapticrender.analysis.load_law import weighted_mean
 from hapticrender.analysis.models import UNITS, FingerFit
 from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
 from hapticrender.formatting import as_json, table
@@ -136,8 +136,7 @@ above the threshold (loaded); grey spans are below it (unloaded), orange ones ne
 {_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits", "too few bands")}
 {_fits(fits)}</section>
 <section><h2>Impedance over the load</h2>
-{_picture("load.png", pictures, "Impedance over load, share explained by the load, exponent over frequency", ONE_LOAD)}
-{_laws(records)}</section>
+{_picture("load.png", pictures, "Impedance over load, share explained by the load", ONE_LOAD)}</section>
 {times}"""
     return html_page(f"The finger, measured: {title}", body)
 
@@ -184,41 +183,7 @@ def _value(fit: FingerFit, name: str) -> str:
     return f"{value:.{digits}f} ± {half:.{digits}f}"
 
 
-def _laws(records: Sequence[FingerRecord]) -> str:
-    """Table of exponents, of all recordings together, and the mean of each where there are several."""
-    law, several = load_exponent(records), len(records) > 1
-    columns = law.frequency, law.exponent, law.standard_error, law.magnitude, law.reference_load, law.count
-    rows = [
-        [f"{frequency:.0f} Hz", _exponent(n, error), f"{size:.2f} N s/m at {load:.2f} N", f"{count}"]
-        for frequency, n, error, size, load, count in zip(*columns, strict=True)
-    ]
-    head, note = ["Frequency", "exponent n", "|Z<sub>f</sub>|", "windows"], ""
-    if several and rows:
-        head.insert(1, "n within a recording")
-        note = " Within a recording: the mean, weighted by errors; beside it, differences between fingers count too."
-        means = mean_exponent([load_exponent(each) for each in records], law.frequency)
-        for row, n, error in zip(rows, *means[:2], strict=True):
-            row.insert(1, _exponent(n, error))
-    return f"""{html_table(html_row("th", head), [html_row("td", row) for row in rows])}
-<p class="note">|Z<sub>f</sub>| ~ W<sup>n</sup>; contact of an elastic sphere suggests n = 1/3.{note}</p>"""
-
-
-def _exponent(n: float, error: float) -> str:
-    return f"{n:.3f} ± {SURE * error:.3f}" if np.isfinite(n) else "–"
-
-
 def _record(record: FingerRecord, name: str, pictures: list[str]) -> str:
-    touched = sum(each.stop - each.start for each in record.of_kind(LOADED))
-    plate = "measured in its unloaded spans" if record.plate.measured else "as in the profile"
-    count, length = len(record.of_kind(LOADED)), record.time[-1] - record.time[0]
-    bandwidths = f"{record.normal_load.bandwidth:.3g} and {record.position.bandwidth:.3g} Hz"
-    entries = [
-        ("Loaded", f"{touched:.2f} of {length:.2f} s, {count} touch{'es' * (count != 1)}"),
-        ("Position good to 1 mm", f"from {record.least_load:.2f} N on" if isfinite(record.least_load) else "nowhere"),
-        ("Bandwidth of load and position", bandwidths),
-        ("The plate's own stiffness and damping", plate),
-        *(("Note", note) for note in record.notes),
-    ]
-    return f"""<section><h2>{escape(record.name)}</h2>
-{_picture(name, pictures, f"Load, impedance, position and velocity over time: {record.name}")}
-<dl>{"".join(f"<dt>{key}</dt><dd>{escape(value)}</dd>" for key, value in entries)}</dl></section>"""
+    """Picture and summary of a recording."""
+    picture = _picture(name, pictures, f"Load, impedance, position and velocity over time: {record.name}")
+    return f"<section><h2>{escape(record.name)}</h2>\n{picture}\n<pre>{escape(text(record))}</pre></section>"

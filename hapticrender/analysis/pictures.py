@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import BAND, LoadLaw, Samples, load_exponent, mean_exponent, weighted_mean
+from hapticrender.analysis.load_law import BAND, LoadLaw, Samples, load_exponent, weighted_mean
 from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
 from hapticrender.analysis.output import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
@@ -87,13 +87,12 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
 
 
 def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
-    """Draw the impedance over the load, how much of it the load explains, and the exponent, over frequency."""
+    """Draw the impedance over the load, and how much of it the load explains, over frequency."""
     pooled, each = load_exponent(records), [load_exponent(one) for one in records]
-    with new_figure((12, 4.2), pads=(0.1, 0.05)) as figure:
-        over_load, share, power = figure.subplots(1, 3, width_ratios=[1.4, 1, 1])
+    with new_figure((9, 4.2), pads=(0.1, 0.05)) as figure:
+        over_load, share = figure.subplots(1, 2, width_ratios=[1.4, 1])
         _over_load(over_load, records, pooled)
         _determination(share, each, pooled)
-        _exponent(power, each, pooled)
         save(figure, path)
 
 
@@ -236,30 +235,12 @@ def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
     """The paper's Fig. 8 D: coefficient of determination between load and impedance, within a recording."""
     for law in each:
         axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
-    mean = mean_exponent(each, pooled.frequency)[2]
+    shares = [(np.log(f), share) for law in each for f, share in zip(law.frequency, law.determination, strict=True)]
+    near = [[share for at, share in shares if abs(at - np.log(f)) < BAND] for f in pooled.frequency]
+    mean = [np.mean(found) if found else np.nan for found in near]
     axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
     axes.set(title="|Z_f| explained by the load", ylabel="R² within a recording", ylim=(-0.03, 1.03))
     _frequency_axis(axes, pooled.frequency)
-
-
-def _exponent(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
-    """Exponent of the impedance over the load, with 1/3 of Hertz contact; of several recordings also their mean."""
-    style = {"marker": "o", "ms": 4, "lw": 1.2, "capsize": 2}
-    shown = [(pooled.exponent, pooled.standard_error)]
-    if len(each) > 1:
-        for law in each:
-            axes.plot(law.frequency, law.exponent, "o", color=PALE, ms=3, alpha=0.7)
-        shown.append(mean_exponent(each, pooled.frequency)[:2])
-        axes.errorbar(pooled.frequency, shown[1][0], SURE * shown[1][1], color=BLUE, label="mean of each", **style)
-    label, colour = ("all together", ORANGE) if len(each) > 1 else ("95 %", BLUE)
-    axes.errorbar(pooled.frequency, pooled.exponent, SURE * pooled.standard_error, color=colour, label=label, **style)
-    axes.axhline(1 / 3, color=INK, lw=1.0, ls="--", label="1/3 (Hertz)")
-    ends = np.concatenate([value + sign * SURE * error for value, error in shown for sign in (-1, 1)])
-    ends = ends[np.isfinite(ends)]
-    axes.set(title="Exponent n of |Z_f| ~ Wⁿ", ylabel="n")
-    axes.set_ylim(min(-0.1, ends.min(initial=0) - 0.1), max(0.8, ends.max(initial=0) + 0.1))
-    _frequency_axis(axes, pooled.frequency)
-    axes.legend(loc="lower right")
 
 
 def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:

@@ -62,8 +62,8 @@ class FingerTracker:
     Examples
     --------
     >>> tracker = FingerTracker(PlateParameters())
-    >>> f"{1e3 * tracker.latency / 5000:.0f} ms, {tracker.bandwidth[0]:.1f} Hz, {1e3 * tracker.load_noise:.1f} mN"
-    '39 ms, 11.7 Hz, 2.3 mN'
+    >>> f"{1e3 * tracker.latency / 5000:.0f} ms, {tracker.bandwidth[0]:.1f} Hz"
+    '39 ms, 11.7 Hz'
     """
 
     def __init__(
@@ -108,11 +108,6 @@ class FingerTracker:
     def bandwidth(self) -> tuple[float, float]:
         """Frequencies (Hz) at which load and position, and the velocity, pass half of the power."""
         return self._line.bandwidths(self._filter.spread)
-
-    @property
-    def load_noise(self) -> float:
-        """Standard error of the load (N) by the sensors' noise, far from a change of contact."""
-        return float(self._white[0] * math.sqrt(self._line.noise[0]))
 
     @property
     def threshold(self) -> float:

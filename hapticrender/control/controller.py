@@ -36,8 +36,8 @@ class BankController(Addressed):
     """A bank of bands behind the `Controller` protocol: settings, state and a compiled step, designed by `method`.
 
     `settings` are fields of `records.SETTINGS`, zero where left out; `history` counts the steps of adaptation whose
-    commands are kept; `note` states what the design chose and why; `arrays` are further ones of the step by the name of
-    their address; the waveform handed to `run` is to be `lookahead` samples ahead.
+    commands are kept; `arrays` are further ones of the step by the name of their address; the waveform handed to `run`
+    is to be `lookahead` samples ahead.
     """
 
     def __init__(
@@ -48,12 +48,11 @@ class BankController(Addressed):
         bands: Bands,
         *,
         history: int = 1,
-        note: str = "",
         arrays: dict[str, Array] | None = None,
         lookahead: int = 0,
     ) -> None:
         self.lookahead = lookahead
-        self.method, self.step, self.bands, self.note = method, step, bands, note
+        self.method, self.step, self.bands = method, step, bands
         self.n_bands = len(bands)
         self.block = int(settings["block"])  # samples that `step` takes at once; `run` takes any multiple
         self.channels, self.sensors = int(settings["channels"]), int(settings["sensors"])

@@ -23,7 +23,7 @@ from hapticrender.control.controller import (
     shared_settings,
     spacing,
 )
-from hapticrender.control.damping import Damping, choose_damping
+from hapticrender.control.damping import Damping, added_damping, choose_damping, oscillators
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.control.kernel import block_step, error_step
 from hapticrender.control.margin_check import checked_settings
@@ -117,8 +117,8 @@ def design_controller(
     refuse_whole_waveform(bands)
     rules = rules.scaled(model.pace)
     by_sample = model.delay <= MOST_DAMPER_DELAY
-    damping = choose_damping(model, bending=model.bending) if any(rules.damper) and feedback and by_sample else None
-    if damping is None or not damping.margins:
+    damping = choose_damping(model) if any(rules.damper) and feedback and by_sample else None
+    if damping is None or not damping.on:
         rules = replace(rules, damper=(0.0, 0.0))
     elif model.always_damped:
         rules = replace(rules, damper=(rules.damper[1], rules.damper[1]))
@@ -126,20 +126,14 @@ def design_controller(
         rules = replace(rules, rest=(0.0, 0.0))
     block = model.block if model.block > 1 and not by_sample else 1
     settings = _settings(model, bands, rules, damping, feedback)
-    why = "the method has none" if by_sample else f"a delay of {model.delay} samples is that of a block device"
-    notes = [damping.text() if damping else f"inner damper off: {why}"]
     if feedback:
         taps = damping.taps if damping else None
-        settings, margins, lowered = checked_settings(
-            model, bands.frequency, settings, wavenumber=bands.wavenumber, taps=taps
-        )
-        notes += [*lowered, *(f"{level}: {each}" for level, each in margins.items())]
+        settings = checked_settings(model, bands.frequency, settings, wavenumber=bands.wavenumber, taps=taps)
     if block > 1:
         settings = _in_blocks(settings, block, model.rate)
-        notes.append(f"in blocks of {block} samples")
     history = int(settings["age"] + 0.5) + 2
     step = block_step if block > 1 else error_step
-    return BankController(method, step, settings, bands, history=history, note="\n".join(notes))
+    return BankController(method, step, settings, bands, history=history)
 
 
 def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> dict[str, float]:
@@ -178,6 +172,7 @@ def _settings(
     lowest = lowest_carrier(model, bands)
     observer = min(rules.observer[0], lowest / 2, spacing(bands) / (2 * math.pi))
     sensor_map, drive_map = model.coordinate_from_sensed, np.linalg.pinv(model.force_from_drive)
+    added = added_damping(oscillators(model), damping.quality) if damping and damping.on else np.zeros(1)
     decay = float((model.damping.diagonal() / model.mass.diagonal()).min()) if model.always_damped else math.inf
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
@@ -188,7 +183,7 @@ def _settings(
         **_gains(model, bands, rules, feedback),
         **{name: getattr(model, name) for name in FROM_MODEL},
         **damper_settings(model, damping.taps if damping else None),
-        "added_damping": np.resize(np.append(damping.added_damping if damping else 0.0, [0.0, 0.0]), 2),
+        "added_damping": np.append(added, [0.0])[:2],
         "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),

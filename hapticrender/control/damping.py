@@ -51,25 +51,16 @@ class BendingMode:
         )
 
 
-@dataclass(frozen=True, kw_only=True)
-class Damping:
-    """An inner damper, or the reason why there is none; `choose_damping` makes it."""
+class Damping(NamedTuple):
+    """An inner damper; `choose_damping` makes it."""
 
     taps: Array  # (coordinates, n), N/m; zero where the damper is off
-    added_damping: Array  # (coordinates,), N s/m, that the taps add at each mode
-    quality: float  # Q of each mode with its damper, but for what the note names; inf where it is off
-    margins: tuple[Margins, ...]  # one for each coordinate; none where the damper is off
-    noise: tuple[float, ...]  # motion from white sensor noise, rms of each coordinate per rms of each sensor
-    note: str  # what was chosen, and why
+    quality: float  # Q of each mode with its damper, where they differ the largest; inf where one is off
 
-    def text(self) -> str:
-        """Return the note and a line of margins for each coordinate."""
-        damped = [i for i, taps in enumerate(self.taps, start=1) if taps.any()]
-        lines = [
-            f"  coordinate {i}: {margins}, noise {noise:.2f} um per um of sensor noise"
-            for i, margins, noise in zip(damped, self.margins, self.noise, strict=True)
-        ]
-        return "\n".join([f"inner damper {self.note}", *lines])
+    @property
+    def on(self) -> bool:
+        """Whether any coordinate has a damper."""
+        return bool(self.taps.any())
 
 
 class Oscillator(NamedTuple):
@@ -183,8 +174,8 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, apart: bool = False) -> Damping:
-    """Design the inner damper: the most damping whose margins hold, or none, and why.
+def choose_damping(model: DeviceModel, *, apart: bool = False) -> Damping:
+    """Design the inner damper: the most damping whose margins hold, or none.
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
     measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
@@ -195,8 +186,9 @@ def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, ap
     couple into, starts at Q 1.4 and needs no notch.
     """
     if not (model.mass.diagonal() > 0.0).all():
-        return _off(len(model.mass), "the device has no mode")
-    known, parts = model.rigid if bending is None else bending.measured, oscillators(model)
+        return _off(len(model.mass))
+    bending, parts = model.bending, oscillators(model)
+    known = model.rigid if bending is None else bending.measured
     plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
     least = QUALITY if known else QUALITY_UNMEASURED
     if not apart:
@@ -206,20 +198,9 @@ def choose_damping(model: DeviceModel, *, bending: BendingMode | None = None, ap
         coupled = bending is not None and bending.coupling[i] != 0.0
         mode = replace(bending, coupling=(bending.coupling[i],)) if bending is not None and coupled else None
         dampers.append(_chosen((part,), least if coupled else QUALITY, mode, plain))
-    return _joined(dampers)
-
-
-def _joined(dampers: list[Damping]) -> Damping:
-    """Join the dampers of single coordinates, of which some may be off."""
     count = max(each.taps.shape[1] for each in dampers)
-    return Damping(
-        taps=np.vstack([np.pad(each.taps, ((0, 0), (0, count - each.taps.shape[1]))) for each in dampers]),
-        added_damping=np.concatenate([each.added_damping for each in dampers]),
-        quality=max(each.quality for each in dampers),
-        margins=tuple(found for each in dampers for found in each.margins),
-        noise=tuple(found for each in dampers for found in each.noise),
-        note="; coordinate 2 ".join(each.note for each in dampers),
-    )
+    taps = [np.pad(each.taps, ((0, 0), (0, count - each.taps.shape[1]))) for each in dampers]
+    return Damping(np.vstack(taps), max(each.quality for each in dampers))
 
 
 def turns(parts: tuple[Oscillator, ...]) -> float:
@@ -230,57 +211,31 @@ def turns(parts: tuple[Oscillator, ...]) -> float:
 @lru_cache(maxsize=256)
 def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: BendingMode | None, plain: int) -> Damping:
     """Raise Q until the margins hold; `plain` taps where no bending mode is known."""
-    rate, delay = parts[0].rate, parts[0].delay
     largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
-    lag = f"a delay of {delay} sample{'s' * (delay != 1)} at {rate:g} Hz"
-    if largest < least_quality:
-        return _off(len(parts), f"the modes damp themselves (Q {WORTH * largest:.1f})")
-    if turns(parts) > 1.0:
-        fastest = max(part.omega for part in parts) / (2 * np.pi)
-        return _off(len(parts), f"{lag} is longer than a period of the mode at {fastest:.0f} Hz")
-    complaint, raised, spared, counts = "", "", "no bending mode is known", [plain]  # numbers of taps worth trying
+    if largest < least_quality or turns(parts) > 1.0:  # the modes damp themselves, or the damper comes too late
+        return _off(len(parts))
+    counts = [plain]  # numbers of taps worth trying
     if bending is not None:
+        rate = parts[0].rate
         spans = (1 + round(span * rate / bending.frequency) for span in REACHES) if any(bending.coupling) else (0,)
         counts = sorted({min(max(TAPS + 2, each), MOST_TAPS) for each in spans})
-        known = "measured" if bending.measured else "estimated"
-        spared = f"taps spare the bending mode {known} at {bending.frequency:.0f} +-{bending.spread:.0f} Hz"
     for step in range(int((largest - least_quality) / QUALITY_STEP) + 1):
         quality = round(least_quality + step * QUALITY_STEP, 1)
-        designs = [damping_taps(parts, quality, bending, count, plain) for count in counts]
-        complaints = [_complaint(parts, taps, bending) for taps in designs]
-        kept = [damper_loops(parts, taps, bending) for taps, each in zip(designs, complaints, strict=True) if not each]
+        designs = (damping_taps(parts, quality, bending, count, plain) for count in counts)
+        kept = [taps for taps in designs if _holds(parts, taps, bending)]
         if kept:
-            noises = [tuple(loop.noise() for loop in loops) for loops in kept]
-            noise, loops = min(zip(noises, kept, strict=True), key=lambda each: max(each[0]))
-            taps = np.array([loop.taps for loop in loops])
-            return Damping(
-                taps=taps,
-                added_damping=added_damping(parts, quality),
-                quality=quality,
-                margins=tuple(loop.margins() for loop in loops),
-                noise=noise,
-                note=f"on: Q {quality:g}{raised}; {f'{taps.shape[1]} ' if bending else ''}{spared}",
-            )
-        complaint = complaints[-1]
-        raised = f" (at Q {quality:g}, with {lag}, {complaint})"
-    return _off(len(parts), f"with {lag}, {complaint} even at Q {quality:g}")
+            noises = [max(loop.noise() for loop in damper_loops(parts, taps, bending)) for taps in kept]
+            return Damping(kept[int(np.argmin(noises))], quality)
+    return _off(len(parts))
 
 
-def _complaint(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> str:
-    """First margin that falls short, with the bending mode at its place and at the ends of its tolerance."""
-    cases = [(bending, LEAST["damper"], "")]
-    if bending is not None:
-        cases += [
-            (corner, LEAST["spread"], f" with the bending mode at {corner.frequency:g} Hz")
-            for corner in bending.corners()
-        ]
-    for mode, bound, where in cases:
-        for loop in damper_loops(parts, taps, mode):
-            if complaint := bound.complaint(loop.margins(), loop.part.rate):
-                return complaint + where
-    return ""
+def _holds(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> bool:
+    """Whether all margins hold, with the bending mode at its place and at the ends of its tolerance."""
+    corners = () if bending is None else bending.corners()
+    cases = [(bending, LEAST["damper"]), *((corner, LEAST["spread"]) for corner in corners)]
+    loops = ((loop, bound) for mode, bound in cases for loop in damper_loops(parts, taps, mode))
+    return not any(bound.complaint(loop.margins(), loop.part.rate) for loop, bound in loops)
 
 
-def _off(coordinates: int, reason: str) -> Damping:
-    taps, none = np.zeros((coordinates, TAPS)), np.zeros(coordinates)
-    return Damping(taps=taps, added_damping=none, quality=math.inf, margins=(), noise=(), note=f"off: {reason}")
+def _off(coordinates: int) -> Damping:
+    return Damping(np.zeros((coordinates, TAPS)), math.inf)

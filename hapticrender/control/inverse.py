@@ -185,8 +185,8 @@ class AdaptiveInverse:
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
-        damping = choose_damping(model, bending=model.bending, apart=True) if feedback else None
-        if damping is not None and not (damping.margins and quiet_enough(damping, model)):
+        damping = choose_damping(model, apart=True) if feedback else None
+        if damping is not None and not (damping.on and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
         state = aligned(1, INVERSE)
@@ -196,9 +196,8 @@ class AdaptiveInverse:
             state[name] = value
         for name, array in rings.items():
             state[f"{name}_at"] = array.ctypes.data
-        note = damping.text() if damping else "inner damper off"
         memory = {"loops": state, **rings}
-        return WaveformController(self.name, inverse_step, settings, bands, note=note, arrays=memory, lookahead=ahead)
+        return WaveformController(self.name, inverse_step, settings, bands, arrays=memory, lookahead=ahead)
 
 
 def quiet_enough(damping: Damping, model: DeviceModel) -> bool:

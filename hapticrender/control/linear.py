@@ -119,4 +119,4 @@ class ErrorLoop:
         outside = math.exp(SLOWEST / rate)
         if unstable_poles(lambda f: self.difference(outside * np.exp(2j * np.pi * f / rate)), contour):
             return Margins.unstable()
-        return margins_of(lambda f: self.loop(np.exp(2j * np.pi * f / rate)), grid, carriers)
+        return margins_of(lambda f: self.loop(np.exp(2j * np.pi * f / rate)), grid)

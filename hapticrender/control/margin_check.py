@@ -1,7 +1,7 @@
 """Check the margins of the error observer's law at each level of the gain schedule, and lower its bandwidth."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,15 +28,7 @@ OF_LOOP = (*LOWERED, "lead", "dc", "dc_drift", "crowd_speed", "lowest", "highest
 """Settings that `error_loop` takes."""
 
 
-class Checked(NamedTuple):
-    """Settings whose margins hold."""
-
-    settings: Settings  # as given, or with lower bandwidths
-    margins: dict[str, Margins]  # the smallest of every margin, by level of the schedule
-    notes: tuple[str, ...]  # what was lowered and why; empty where nothing was
-
-
-CHECKED: dict[tuple[Any, ...], Checked] = {}
+CHECKED: dict[tuple[Any, ...], Settings] = {}
 """What was found before, by all that it follows from: a check takes 0.2 s, the rest of a render of 1 s 0.03 s."""
 MOST_CHECKED = 256
 
@@ -102,7 +94,7 @@ def checked_settings(
     wavenumber: Array | None = None,
     taps: Array | None = None,
     least: LeastMargins = LEAST["law"],
-) -> Checked:
+) -> Settings:
     """Lower the bandwidth until the margins on the free device hold at every level of the gain schedule.
 
     The arguments are those of `error_loop`.  Observer and integral are lowered together, a quarter octave at a time;
@@ -120,38 +112,32 @@ def checked_settings(
         found = CHECKED[key] = _checked(model, frequency, settings, wavenumber, taps, least)
     for oldest in list(CHECKED)[:-MOST_CHECKED]:
         CHECKED.pop(oldest, None)
-    return found._replace(settings={**settings, **{name: found.settings[name] for name in LOWERED}})
+    return {**settings, **{name: found[name] for name in LOWERED}}
 
 
 def _checked(
     model: DeviceModel, frequency: Array, settings: Settings, wavenumber: Array, taps: Array, least: LeastMargins
-) -> Checked:
+) -> Settings:
     locked = wavenumber[wavenumber > 0.0]
     speeds = _speeds(settings, locked)
     highest = float(frequency.max(initial=settings["highest"] if locked.size else 0.0))
-    known: dict[tuple[float, float, float], Margins] = {}
-
-    def worst(settings: Settings, level: str) -> Margins:
-        """Smallest of every margin at a level over all speeds of the finger."""
-        key = scheduled(settings, level)
-        if key not in known:
-            loops = [
-                error_loop(model, frequency, settings, level, wavenumber=wavenumber, taps=taps, speed=speed)
-                for speed in speeds
-            ]
-            known[key] = Margins.smallest([loop.margins() for loop in loops])
-        return known[key]
+    known: dict[tuple[float, float, float], list[Margins]] = {}
 
     def complaint(settings: Settings, levels: tuple[str, ...]) -> str:
-        """Name the first margin that falls short at these levels; empty where all hold."""
-        found = (least.complaint(worst(settings, level), model.rate, highest) for level in levels)
-        return next((text for text in found if text), "")
+        """Name the first margin that falls short at these levels, at any speed of the finger; empty where all hold."""
+        for level in levels:
+            gains = scheduled(settings, level)
+            if gains not in known:
+                moved = [{"wavenumber": wavenumber, "taps": taps, "speed": speed} for speed in speeds]
+                known[gains] = [error_loop(model, frequency, settings, level, **each).margins() for each in moved]
+            found = (least.complaint(margins, model.rate, highest) for margins in known[gains])
+            if text := next(filter(None, found), ""):
+                return text
+        return ""
 
-    notes: list[str] = []
     for levels, rates, damper in GROUPS:
-        settings, lowered = _lowered(complaint, settings, levels, rates, damper)
-        notes += lowered
-    return Checked(settings, {level: worst(settings, level) for level in SCHEDULE}, tuple(notes))
+        settings = _lowered(complaint, settings, levels, rates, damper)
+    return settings
 
 
 def _scaled(settings: Settings, names: tuple[str, ...], factor: float) -> Settings:
@@ -164,33 +150,19 @@ def _lowered(
     levels: tuple[str, ...],
     rates: tuple[str, ...],
     damper: str,
-) -> tuple[Settings, list[str]]:
-    """Lower the gains of a group of levels until their margins hold; say what was lowered."""
-    first = complaint(settings, levels)
-    if not first:
-        return settings, []
-    name, notes = " and ".join(levels), []
-    narrow = complaint(_scaled(settings, rates, LEAST_SHARE), levels)
-    if narrow and settings[damper] > 0.0:
-        for soft in SOFTER:
-            softer = _scaled(settings, (damper,), soft)
-            if not complaint(_scaled(softer, rates, LEAST_SHARE), levels):
-                settings = softer
-                notes.append(
-                    f"inner damper ({name}) softened to {soft:.0%}: even at {LEAST_SHARE:.0%} of the bandwidth {narrow}"
-                )
-                break
+) -> Settings:
+    """Lower the gains of a group of levels until their margins hold."""
+    if complaint(settings, levels) and settings[damper] > 0.0:
+        softer = (settings, *(_scaled(settings, (damper,), soft) for soft in SOFTER))
+        holds = (each for each in softer if not complaint(_scaled(each, rates, LEAST_SHARE), levels))
+        settings = next(holds, settings)
     for step in STEPS.tolist():
         tried = _scaled(settings, rates, step)
         short = complaint(tried, levels)
         if not short:
-            if step < 1.0:
-                notes.append(f"bandwidth ({name}) lowered to {step:.0%} of the rule: at the rule {first}")
-            return tried, notes
-    raise DesignError(
-        f"{short} ({name}) even at 1/64 of the bandwidth of the rule: lower the delay, leave the highest or "
-        "closest carriers out, or allow a smaller margin"
-    )
+            return tried
+    cure = "lower the delay, leave the highest or closest carriers out, or allow a smaller margin"
+    raise DesignError(f"{short} ({' and '.join(levels)}) even at 1/64 of the bandwidth of the rule: {cure}")
 
 
 def _speeds(settings: Settings, locked: Array) -> Array:

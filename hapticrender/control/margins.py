@@ -11,7 +11,7 @@ Astrom and Murray, Feedback Systems, 2nd ed., 2021, chapters 10 and 13.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +24,6 @@ PER_DECADE = 12  # points of a grid on either side of a carrier
 UNIFORM = 400  # points of a grid over the whole spectrum
 ZOOMS, NEARLY = 3, 0.7  # refinements of a peak search, and which peaks are refined: above this share of the highest
 CONTINUOUS = 2.0  # rad: a locus that turns by more between two points has passed through infinity, at a carrier
-SMALLEST = ("delay", "phase", "gain", "bandwidth")  # margins of which the smallest counts, each for itself
 BISECTIONS = 24  # of a grid where the return difference turns by more than a radian
 
 
@@ -38,28 +37,11 @@ class Margins:
     delay: float  # s: largest extra delay, the same in every coordinate
     phase: float  # rad: largest error of the plant's phase, the same in every coordinate and at every frequency
     gain: float  # >= 1: the loop bears the plant times this factor and divided by it
-    bandwidth: float = math.inf  # Hz: so close to every carrier S stays below 1/sqrt 2; inf where there is no carrier
 
     @classmethod
     def unstable(cls) -> "Margins":
         """Return the margins of a loop with a growing pole."""
-        return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0, bandwidth=0.0)
-
-    @classmethod
-    def smallest(cls, found: list["Margins"]) -> "Margins":
-        """Return the smallest of every margin, each for itself."""
-        smallest = {name: min(getattr(margins, name) for margins in found) for name in SMALLEST}
-        least = min(found, key=lambda margins: margins.modulus)
-        return replace(least, stable=all(margins.stable for margins in found), **smallest)
-
-    def __str__(self) -> str:
-        if not self.stable:
-            return "unstable"
-        bandwidth = f", bandwidth {self.bandwidth:.2f} Hz" if math.isfinite(self.bandwidth) else ""
-        return (
-            f"modulus margin {self.modulus:.2f} at {self.worst_frequency:.0f} Hz, gain margin {self.gain:.3g}, "
-            f"phase margin {math.degrees(self.phase):.0f} deg, delay margin {1e3 * self.delay:.2f} ms{bandwidth}"
-        )
+        return cls(stable=False, modulus=0.0, worst_frequency=math.nan, delay=0.0, phase=0.0, gain=1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,27 +133,16 @@ def unstable_poles(difference: Callable[[Array], Array], grid: Array) -> int:
     return round(-np.angle(values[1:] / values[:-1]).sum() / np.pi)
 
 
-def margins_of(loop: Callable[[Array], Array], grid: Array, carriers: Array | None = None) -> Margins:
+def margins_of(loop: Callable[[Array], Array], grid: Array) -> Margins:
     """Read every margin of a stable loop off its frequency response, complex (n, c, c) at frequencies (Hz, (n,)).
 
     `grid` (Hz) is ascending, > 0 and dense where L changes fast; S is searched more finely around its peaks.
-    `bandwidth` is measured about the `carriers` (Hz).
     """
     values = loop(grid)
     peak = sensitivity(values)
     highest, where = highest_peak(lambda frequency: sensitivity(loop(frequency)), grid, peak)
     delay, phase, gain = borne_errors(grid, values)
-    wide = grid[peak >= math.sqrt(0.5)]
-    widths = [np.abs(wide - carrier).min(initial=np.inf) for carrier in ([] if carriers is None else carriers)]
-    return Margins(
-        stable=True,
-        modulus=1.0 / highest,
-        worst_frequency=where,
-        delay=delay,
-        phase=phase,
-        gain=gain,
-        bandwidth=float(min(widths, default=math.inf)),
-    )
+    return Margins(stable=True, modulus=1.0 / highest, worst_frequency=where, delay=delay, phase=phase, gain=gain)
 
 
 def sensitivity(loop: Array) -> Array:

@@ -4,8 +4,8 @@ Insulator, stratum corneum, sliding gap and body are in series; a current of pea
 whatever the gap's thickness (docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not
 attracted.  The current that is measured is that of the source, with what a stray capacitance across it takes.
 
-Two levels: "carrier" integrates the circuit over every substep exactly, with the offset of the current source, its
-servo and its compliance; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
+Two levels: "carrier" integrates the circuit over every substep exactly, with the compliance of the current source;
+"envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
 for a few of its time constants.
 """
 
@@ -83,7 +83,6 @@ class ElectroadhesionParameters(SlidingParameters):
     Notes
     -----
     Electrical defaults per m2 from docs/theory.md; gap, leakage and body are engineering values.
-    Offset and servo act at the level "carrier" only.
     """
 
     level: str = option("envelope", "envelope", "carrier", about="of the model")
@@ -103,18 +102,13 @@ class ElectroadhesionParameters(SlidingParameters):
     gap_thickness: float = parameter(1.5e-6, "m", "while sliding (0.5-3 um)", above=0.0)
     gap_resistance: float = parameter(NORMAL, "ohm m2", "leakage of the sliding gap: DRY, NORMAL or MOIST", above=0.0)
     gap_short: float = parameter(0.0, "ohm m2", "the same while the finger rests", most=0.1)
-    ripple: float = parameter(0.0, about="share by which the gap varies with the position", most=0.9)
-    ripple_wavelength: float = parameter(0.5e-3, "m", "of that", above=0.0)
     body_resistance: float = parameter(1e3, "ohm", "body and return (0.5-2 kohm)")
     unevenness: float = parameter(1.0, about="kappa = <d^-2>/<d^-1>^2 of the gap (1-3)", least=1.0, most=10.0)
     current_limit: float = parameter(10e-3, "A", "largest peak of the source where the drive is a current", above=0.0)
     voltage_limit: float = parameter(300.0, "V", "its compliance, peak (150-300); largest drive in V", above=0.0)
-    current_offset: float = parameter(0.0, "A", "direct current that the source leaks", least=-1e-3, most=1e-3)
-    servo_conductance: float = parameter(1e-7, "S", "the source bleeds this times its mean voltage, 0: no servo")
     stray_capacitance: float = parameter(0.0, "F", "across the source")
     voltage_noise: float = parameter(0.5, "V", "white noise at every substep, rms")
     current_noise: float = parameter(20e-6, "A", "white noise at every substep, rms")
-    skew: float = parameter(0.0, "s", "delay of the current's channel", least=-1e-5, most=1e-5)
     estimator_bandwidth: float = parameter(1500.0, "Hz", "of the estimator's STDFT*, < rate/2", above=0.0)
     estimator_smoothing: float = parameter(5e-3, "s", "for the impedance's average, at least a sample", above=0.0)
     least_leakage: float = parameter(0.5, about="L below which a gap leaks too much to be measured", most=1.0)
@@ -237,13 +231,10 @@ def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoo
         compensated=compensation is not None,
         substep=substep,
         turn=turn,
-        skew=np.exp(-1j * p.omega * p.skew),
-        wavenumber=2 * math.pi / p.ripple_wavelength,
         area=p.area(1.0),
         capacitance=(p.insulator_capacitance, p.corneum_capacitance, VACUUM / p.gap_thickness),
         retention=[each[0] for each in elements],
         alternating=[each[1] for each in elements],
-        direct=[each[2] for each in elements],
         gap=gap_record(p)[0],
         sliding=sliding_record(p)[0],
     )

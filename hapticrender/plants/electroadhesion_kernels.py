@@ -1,9 +1,9 @@
 """Compiled electroadhesive screen with a finger on it: the circuit at the carrier, or its envelope, and friction.
 
 Charges q_k of the insulator, the stratum corneum and the gap obey q' = i - q/tau with tau = R C, which does not depend
-on the contact area.  Over a substep h the current is I cos(theta + w u) plus a direct part, and exactly::
+on the contact area.  Over a substep h the current is I cos(theta + w u), and exactly::
 
-    q+ = a q + I Re(e^{j theta} (e^{j w h} - a)/(j w + 1/tau)) + i_dc tau (1 - a),  a = e^{-h/tau}
+    q+ = a q + I Re(e^{j theta} (e^{j w h} - a)/(j w + 1/tau)),  a = e^{-h/tau}
 
 The carrier turns a whole number of times in a sample, so every sample starts at theta = 0.
 """
@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, step
-from hapticrender.plants.compiled import HUGE, LOAD, POSITION, SATURATED, SENSOR_CLIPPED, SPEED
+from hapticrender.plants.compiled import HUGE, LOAD, SATURATED, SENSOR_CLIPPED, SPEED
 from hapticrender.plants.gap_estimator import GAP, VACUUM, gap_step
 from hapticrender.plants.sliding_contact import SLIDING, sliding_step
 from hapticrender.protocols import Flag
@@ -25,8 +25,8 @@ INPUTS = 4  # columns of the inputs
 
 FLAGS = ("carrier", "voltage", "sensing", "compensated", "straight")  # level, kind of drive, sensor, square root
 NUMBERS = (  # named as in `ElectroadhesionParameters` and `SquareRoot`
-    *("bias", "floor", "gain", "omega", "current_limit", "voltage_limit", "current_offset", "servo_conductance"),
-    *("stray_capacitance", "body_resistance", "gap_thickness", "gap_resistance", "gap_short", "ripple", "unevenness"),
+    *("bias", "floor", "gain", "omega", "current_limit", "voltage_limit"),
+    *("stray_capacitance", "body_resistance", "gap_resistance", "gap_short", "unevenness"),
     *("area_exponent", "voltage_noise", "current_noise", "friction_coefficient"),
 )
 SCREEN = np.dtype(
@@ -34,18 +34,14 @@ SCREEN = np.dtype(
     + [(name, "f8") for name in NUMBERS]
     + [
         ("series_impedance", "c16"),  # ohm m2
-        ("wavenumber", "f8"),  # of the ripple, rad/m
         ("area", "f8"),  # m2 at 1 N
         ("substep", "f8"),  # h, s
         ("turn", "c16"),  # e^{j w h}
-        ("skew", "c16"),  # e^{-j w skew}: delay of the current's channel
-        ("capacitance", "f8", (3,)),  # F/m2 of insulator, stratum corneum, gap (set sample by sample)
+        ("capacitance", "f8", (3,)),  # F/m2 of insulator, stratum corneum, gap
         ("retention", "f8", (3,)),  # a of their charges in a substep
         ("alternating", "c16", (3,)),  # (e^{j w h} - a)/(j w + 1/tau), s
-        ("direct", "f8", (3,)),  # tau (1 - a), s
         ("charge", "f8", (3,)),  # state: C
         ("envelopes", "c16", (2,)),  # state: V and A of the last sample
-        ("bleed", "f8"),  # state: current of the servo, A
         ("reading", "f8"),  # state: estimated attraction (N), output at the next sample
         ("open_loop", "i8"),  # state: whether it is the nominal one
         ("gap", GAP),
@@ -58,12 +54,12 @@ SCREEN_T = numba.from_dtype(SCREEN)
 
 @kernel
 def element(tau, substep, omega, turn):
-    """Share of its charge that an element with the time constant `tau` (s) keeps in a substep, and its gains (s).
+    """Share of its charge that an element with the time constant `tau` (s) keeps in a substep, and its gain (s).
 
-    The gains are those of a current at the carrier, whose phase is e^{j theta} at the start, and of a direct one.
+    The gain is that of a current at the carrier, whose phase is e^{j theta} at the start.
     """
     a, lag = math.exp(-substep / tau), omega * tau
-    return a, (turn - a) * complex(1.0, -lag) * (tau / (1.0 + lag * lag)), -tau * math.expm1(-substep / tau)
+    return a, (turn - a) * complex(1.0, -lag) * (tau / (1.0 + lag * lag))
 
 
 @kernel
@@ -78,23 +74,22 @@ def within(start, change, current, limit):
 
 
 @kernel
-def substep_pass(s, area, peak, direct, phasor):
-    """Advance the charges by a substep under a current of `peak` and a `direct` part (A), from e^{j theta} = `phasor`.
+def substep_pass(s, area, peak, phasor):
+    """Advance the charges by a substep under a current of `peak` (A), from e^{j theta} = `phasor`.
 
     Returns the voltage (V) at its end and the peak that the source's compliance leaves.
     """
-    q = s.charge
-    start = end = s.body_resistance * direct
+    q, start, end = s.charge, 0.0, 0.0
     at_start, at_end = s.body_resistance * phasor.real, s.body_resistance * (phasor * s.turn).real
     for k in range(3):
         inverse = 1.0 / (area * s.capacitance[k])
         start += q[k] * inverse
-        end += (s.retention[k] * q[k] + s.direct[k] * direct) * inverse
+        end += s.retention[k] * q[k] * inverse
         at_end += (s.alternating[k] * phasor).real * inverse
     peak = within(start, at_start, peak, s.voltage_limit)
     peak = within(end, at_end, peak, s.voltage_limit)
     for k in range(3):
-        q[k] = s.retention[k] * q[k] + (s.alternating[k] * phasor).real * peak + s.direct[k] * direct
+        q[k] = s.retention[k] * q[k] + (s.alternating[k] * phasor).real * peak
     return end + at_end * peak, peak
 
 
@@ -102,23 +97,19 @@ def substep_pass(s, area, peak, direct, phasor):
 def carrier_pass(s, area, peak, source, noise):
     """Advance the circuit by a sample of the carrier; return the mean attraction (N) and flags.
 
-    `source` is the current that the current's channel shows per current through the finger.
+    `source` is the current of the source per current through the finger.
     """
-    flags, direct, phasor = 0, s.current_offset + s.bleed, 1.0 + 0.0j
-    squares, total, voltages, currents = 0.0, 0.0, 0j, 0j
+    flags, phasor, share = 0, 1.0 + 0.0j, 1.0 / s.oversampling
+    squares, voltages, currents = 0.0, 0j, 0j
     for k in range(s.oversampling):
-        voltage, passed = substep_pass(s, area, peak, direct, phasor)
+        voltage, passed = substep_pass(s, area, peak, phasor)
         if passed != peak:
             flags = SATURATED
         phasor *= s.turn
         squares += s.charge[2] * s.charge[2]
-        total += voltage
         if s.sensing:
-            current = passed * (source * phasor).real + direct + s.current_noise * noise[2 + 2 * k]
             voltages += (voltage + s.voltage_noise * noise[1 + 2 * k]) * phasor.conjugate()
-            currents += current * phasor.conjugate()
-    share = 1.0 / s.oversampling
-    s.bleed = -s.servo_conductance * total * share
+            currents += (passed * (source * phasor).real + s.current_noise * noise[2 + 2 * k]) * phasor.conjugate()
     s.envelopes[0], s.envelopes[1] = 2.0 * share * voltages, 2.0 * share * currents
     return s.unevenness * squares * share / (2.0 * VACUUM * area), flags
 
@@ -135,22 +126,20 @@ def attract(s, drive, x, noise):
     flags = SATURATED if abs(peak) > limit else 0
     peak = min(max(peak, -limit), limit)
     if math.isnan(speed):  # lifted: no charge is left, and only the source's current can be measured
-        s.charge[0] = s.charge[1] = s.charge[2] = s.bleed = 0.0
+        s.charge[0] = s.charge[1] = s.charge[2] = 0.0
         s.envelopes[0], s.envelopes[1] = 0j, complex(0.0 if s.voltage else peak, 0.0)
         return 0.0, 0
     area = s.area * load**s.area_exponent
-    thickness = s.gap_thickness * (1.0 + s.ripple * math.cos(s.wavenumber * x[POSITION]))
     resistance = s.gap_short if abs(speed) < s.sliding.least_speed else s.gap_resistance
-    lag = s.omega * resistance * VACUUM / thickness
+    tau = resistance * s.capacitance[2]
+    lag = s.omega * tau
     gap = complex(1.0, -lag) * (resistance / (1.0 + lag * lag))  # ohm m2
     impedance = s.body_resistance + (s.series_impedance + gap) * (1.0 / area)
     source = 1.0 + complex(0.0, s.omega * s.stray_capacitance) * impedance  # its current per current of the finger
     peak /= abs(impedance) if s.voltage else abs(source)
     if s.carrier:
-        s.capacitance[2] = VACUUM / thickness
-        tau = resistance * VACUUM / thickness
-        s.retention[2], s.alternating[2], s.direct[2] = element(tau, s.substep, s.omega, s.turn)
-        force, cut = carrier_pass(s, area, peak, source * s.skew, noise)
+        s.retention[2], s.alternating[2] = element(tau, s.substep, s.omega, s.turn)
+        force, cut = carrier_pass(s, area, peak, source, noise)
         return force, flags | cut
     passed = within(0.0, abs(impedance), peak, s.voltage_limit)
     force = s.unevenness * passed * passed * (lag * lag / (1.0 + lag * lag)) / (4.0 * s.omega * s.omega * VACUUM * area)

@@ -8,7 +8,6 @@ damped, since the force is known through the drive alone.  Every control law sca
 """
 
 import math
-import warnings
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -20,7 +19,7 @@ import numpy as np
 from hapticrender.checks import require
 from hapticrender.devices import naming_driver, open_driver, registered
 from hapticrender.driver_checks import check_channels, check_driver, check_sensed
-from hapticrender.errors import DesignError, PlateMismatch
+from hapticrender.errors import DesignError
 from hapticrender.plants.fitting import (
     BENDING,
     CLEAREST,
@@ -55,15 +54,6 @@ UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
 TRIES = 10  # where samples are lost
 CONTACT = 0.05  # N: largest static load
 SIGNIFICANT = 2.0  # half-widths of the 95 % interval: exceeded by chance once in 10 000 numbers
-TOLERABLE = MappingProxyType(  # relative, delay in samples: differences that the controller takes without a warning
-    {
-        **dict.fromkeys(MECHANICAL[:4], 0.01),
-        **dict.fromkeys(MECHANICAL[4:], 0.1),
-        "delay": 0.25,
-        "gain_difference": 0.01,
-        **dict(zip(BENDING, (0.02, 0.5, 0.2), strict=True)),
-    }
-)
 
 
 class SamplesLost(DesignError):
@@ -84,12 +74,6 @@ class Difference(NamedTuple):
     found: float
     designed: float
     interval: float
-
-    @property
-    def excess(self) -> float:
-        """Least difference that is beyond chance, relative to the designed value (delay: samples, gain: 1)."""
-        scale = abs(self.designed) if self.name in (*MECHANICAL, *BENDING) else 1.0
-        return (abs(self.found - self.designed) - SIGNIFICANT * self.interval) / max(scale, 1e-300)
 
     def __str__(self) -> str:
         change = self.found - self.designed
@@ -183,30 +167,6 @@ class Identified:
         )
 
 
-def compare(found: Identified, designed: PlateParameters) -> tuple[Difference, ...]:
-    """Compare an identified plate with the one that a controller is designed for, as in the scene's [device] table.
-
-    Returns the significant differences: beyond twice the half-width of the 95 % interval, which equal plates exceed in
-    one comparison of a thousand.
-
-    Warns
-    -----
-    PlateMismatch
-        A difference is significant beyond `TOLERABLE`: 1 % of m, I, k and gain, 10 % of b, a quarter of a sample; 2 %
-        of a bending mode's frequency, 20 % of its shape at the coils, 50 % of its damping.
-    """
-    differences = found.differences(designed)
-    grave = [str(each) for each in differences if each.excess > TOLERABLE[each.name]]
-    if grave:
-        warnings.warn(
-            f"the plate differs from the one that the controller is designed for: {'; '.join(grave)}; put the "
-            "identified values into [device], and the delay into the driver",
-            PlateMismatch,
-            stacklevel=2,
-        )
-    return differences
-
-
 def identify(
     driver: Driver | str,
     parameters: PlateParameters,
@@ -276,7 +236,7 @@ def identify(
         sine = design_multisine(parameters, rate, samples, amplitude)
     start, fade = round(wait * rate), round(RAMP * rate)
     sensed = play(driver, _whole_drive(sine, start, fade)).sensed[start : start + samples]
-    _check_range(sensed, parameters)
+    check_range(sensed, parameters.sensor_range / 2, "m")
     record = spectra(rate, sine, sensed)
     _check_response(record, amplitude)
     latest = round((wait - RAMP) * rate)
@@ -354,7 +314,10 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
             if raised & (Flag.SATURATED | Flag.SENSOR_CLIPPED):
                 raise DesignError(f"sample {start}: the device reports {raised.name}: decrease amplitude")
             if raised & Flag.OVERRUN:
-                cure = "free the computer, or take larger blocks (--driver 'audio:NAME?block=1024' and sound server)"
+                cure = (
+                    "free the computer; take larger blocks of a sound card (--driver 'audio:NAME?block=1024', and of "
+                )
+                cure += "its server), or a faster line to a board ('serial:PORT?baud=921600', or USB)"
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
@@ -367,16 +330,15 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
     return Sensed(*columns)
 
 
-def _check_range(sensed: Array, parameters: PlateParameters) -> None:
-    """Refuse samples that are not finite or at the end of a sensor's range."""
-    bound = parameters.sensor_range / 2
+def check_range(sensed: Array, bound: float, unit: str) -> None:
+    """Refuse samples (n, sensors) that are not finite or at the end of a sensor's range."""
     with np.errstate(invalid="ignore"):
         bad = np.argwhere(~(abs(sensed) < bound))
     if len(bad):
         sample, channel = bad[0]
         raise DesignError(
-            f"sensor {channel + 1}: {sensed[sample, channel]:g} m at sample {sample}: must be within +-{bound:g} m; "
-            "check its unit and zero, or decrease amplitude"
+            f"sensor {channel + 1}: {sensed[sample, channel]:g} {unit} at sample {sample}: must be within +-{bound:g} "
+            f"{unit}; check its unit and zero, or decrease amplitude"
         )
 
 

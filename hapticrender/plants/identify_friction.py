@@ -24,7 +24,7 @@ from hapticrender.driver_checks import check_channels, check_driver
 from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.fitting import as_real
-from hapticrender.plants.identify import SIGMAS_95, Estimate, play
+from hapticrender.plants.identify import SIGMAS_95, Estimate, check_range, play
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Driver
 from hapticrender.touch.finger import Finger
@@ -42,7 +42,6 @@ UNEXPLAINED = 0.1  # largest share of the response that the model may leave
 class IdentifiedDevice(NamedTuple):
     """Identified parameters of a friction device, each with its 95 % interval."""
 
-    kind: str
     estimates: Mapping[str, Estimate]
     unexplained: float  # share of the measurement that the model leaves, noise included
 
@@ -81,9 +80,9 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     spectrum[bins] = np.exp(1j * phase)
     drive = np.fft.irfft(spectrum, samples)
     drive *= SHARE * mode.drive_limit / abs(drive).max()
-    played = play(driver, drive[np.arange(-start, samples) % samples, None]).sensed[start:, 0]
-    _check_range(played, mode.sensor_range / 2, "m")
-    u, y = (np.fft.rfft(signal)[bins] * (2 / samples) for signal in (drive, played))
+    played = play(driver, drive[np.arange(-start, samples) % samples, None]).sensed[start:]
+    check_range(played, mode.sensor_range / 2, "m")
+    u, y = (np.fft.rfft(signal)[bins] * (2 / samples) for signal in (drive, played[:, 0]))
     w = 2 * np.pi * bins * base
     u = u * np.sinc(w / rate / (2 * np.pi)) * np.exp(-1j * w * (driver.delay - driver.block + 0.5) / rate)
 
@@ -104,7 +103,7 @@ def identify_resonance(driver: Driver, parameters: SurfaceParameters, seconds: f
     spread = _spread(fit.jac, fit.fun, np.arange(len(fit.fun)))
     values = np.exp(fit.x[:3]) * [mode.frequency, mode.quality, mode.force_constant]
     names = ("frequency", "quality", "force_constant")
-    found = _found("ultrasonic", type(parameters), names, values, values * spread[:3], fit.fun, as_real(y) / scale)
+    found = _found(type(parameters), names, values, values * spread[:3], fit.fun, as_real(y) / scale)
     turn, late = rate / values[0], fit.x[3]
     if not abs(late) <= LATE:
         raise DesignError(
@@ -141,8 +140,8 @@ def identify_screen(
         enough = f"more than {UNKNOWNS} periods of {1 / MODULATION:g} s, of which the first does not count"
         raise DesignError(f"finger: must slide in {enough}, for intervals of what is found")
     columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
+    check_range(sensed.sensed[sliding], parameters.force_range, "N")
     friction = abs(sensed.sensed[sliding, 0])  # as `render` takes it: it may keep the sign of the lateral force
-    _check_range(friction, parameters.force_range, "N")
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
     mu, gain = found[0], found[1] / found[0]
@@ -151,7 +150,7 @@ def identify_screen(
     halves = np.array([spread[0], gain * math.hypot(spread[1] / found[1], spread[0] / mu)])
     changing = columns[:, 1:] @ found[1:]
     names = ("friction_coefficient", "open_loop_gain")
-    return _found("electroadhesion", type(parameters), names, values, halves, residual, changing - changing.mean())
+    return _found(type(parameters), names, values, halves, residual, changing - changing.mean())
 
 
 def _spread(jacobian: Array, residual: Array, group: Array) -> Array:
@@ -162,17 +161,7 @@ def _spread(jacobian: Array, residual: Array, group: Array) -> Array:
     return SIGMAS_95 * np.sqrt(np.diagonal(covariance) * len(groups) / max(len(groups) - jacobian.shape[1], 1))
 
 
-def _check_range(sensed: Array, bound: float, unit: str) -> None:
-    """Refuse what no sensor of the device can measure."""
-    most = float(abs(sensed).max())
-    if not most <= bound:
-        raise DesignError(
-            f"sensed {most:.3g} {unit}: must be <= {bound:g} {unit}, the sensor's range; is it in {unit}?"
-        )
-
-
 def _found(
-    kind: str,
     parameters: type[SurfaceParameters | ElectroadhesionParameters],
     names: tuple[str, ...],
     values: Array,
@@ -188,7 +177,7 @@ def _found(
             "and [device]"
         )
     pairs = (Estimate(float(value), float(half)) for value, half in zip(values, halves, strict=True))
-    found = IdentifiedDevice(kind, dict(zip(names, pairs, strict=True)), unexplained)
+    found = IdentifiedDevice(dict(zip(names, pairs, strict=True)), unexplained)
     try:
         parameters.with_overrides(found.profile())
     except ValueError as error:

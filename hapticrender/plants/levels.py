@@ -234,7 +234,7 @@ def _screen_difference(scene: Scene) -> float:
 
     A step of the current's envelope leaves a charge p on the gap, which decays with tau = R C. With modulation i at w,
     p = Re(Q) j w tau/(1 + j w tau) i over I; the carrier level adds 2 I <Re(Q e^(j w_c t)) e^(-t/tau)> p to the
-    attraction I^2 |Q|^2/2, Q = 1/(j w_c + 1/tau); a direct current i_dc adds 2 i_dc tau <e^(-t/tau)> p.
+    attraction I^2 |Q|^2/2, Q = 1/(j w_c + 1/tau).
     """
     p = ElectroadhesionParameters.with_overrides(_numbers(scene))
     w = 2 * np.pi * _path(scene, scene.texture.bands(p.rate))[2].max(initial=0.0)
@@ -244,8 +244,7 @@ def _screen_difference(scene: Scene) -> float:
     decay = np.exp(-time / tau)
     step = abs(charge.real) * w / p.rate / abs(1 - decay[-1] * np.exp(-1j * w / p.rate))
     swing = abs(np.mean((charge * np.exp(1j * p.omega * time)).real * decay))
-    direct = abs(p.current_offset) * tau * np.mean(decay) / p.current_limit
-    return float(step * 2 * (swing + direct) / abs(charge) ** 2)
+    return float(step * 2 * swing / abs(charge) ** 2)
 
 
 def _surface_difference(scene: Scene) -> float:

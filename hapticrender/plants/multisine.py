@@ -27,10 +27,8 @@ class Multisine(NamedTuple):
     """One period of drive, and its lines."""
 
     bins: Array  # lines of equal motion, in periods a record, ascending
-    coordinate: Array  # that each of them drives: 0 heave, 1 rocking
     above: Array  # bins of the lines of equal current in heave, ascending
     drive: Array  # one period, rounded to the steps of the command (A, (samples, 2))
-    motion: float  # amplitude of every line at the ends of the glass, on the plate that it was designed for (m)
 
 
 def design_multisine(parameters: PlateParameters, rate: float, samples: int, amplitude: float) -> Multisine:
@@ -70,7 +68,7 @@ def design_multisine(parameters: PlateParameters, rate: float, samples: int, amp
             f"amplitude = {amplitude:g} m: needs {peak:.3g} A, must be <= {parameters.current_limit:g} A; "
             f"the drive allows {amplitude * parameters.current_limit / peak:.3g} m"
         )
-    return Multisine(bins, coordinate, above, drive, motion)
+    return Multisine(bins, above, drive)
 
 
 def _check(

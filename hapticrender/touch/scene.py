@@ -3,7 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, fields
 from itertools import count
 from numbers import Integral
 from pathlib import Path
@@ -85,6 +85,20 @@ def _read_table(name: str, values: Any) -> dict[str, Value]:
     return found
 
 
+def _texture(key: str, value: Any) -> Texture:
+    known = isinstance(value, Texture) and not isinstance(value, type)
+    checks.require(known, key, value, "a texture with bands(rate) and waveform(time, position)", TypeError)
+    return value  # type: ignore[no-any-return]
+
+
+def _finger(key: str, value: Any) -> Finger:
+    """Refuse several fingers, too: a device senses the sum of all touches, and the law has one finger's model."""
+    if isinstance(value, list | tuple):
+        raise ValueError(f"{key}: {len(value)} fingers are stated: must be one, a device renders for one finger")
+    checks.require(isinstance(value, Finger), key, value, "a Finger", TypeError)
+    return value  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Scene(Validated):
     """Everything that a rendering depends on, in SI; frozen, compared by value, TOML in and out.
@@ -95,47 +109,12 @@ class Scene(Validated):
     "plate.toml"``, or beside parameters ``[device] profile = "plate.toml"``, names the file of a `DeviceProfile`, seen
     from the scene's folder.
 
-    Parameters
-    ----------
-    texture : Texture
-        `Grating`, `Recorded`, `Swipe`, `Synthetic`, `Chirp`, `Sum` (``a + 0.5 * b``), `Playlist`, or any object that
-        follows ``protocols.Texture``.
-    finger : Finger
-        Default: none; a texture that is read at the finger's position needs one.
-    device : str
-        Kind of device: name of a renderer; or the file (.toml) of a `DeviceProfile`, which is read at once: the scene
-        then has its kind, parameters, limits and calibration, those given here before those of the file.
-    profile, simulation : mapping of str to number, str or bool
-        Parameters of the device for which the controller is designed, where they differ from the kind's defaults; of
-        the simulated device, where they differ from the profile, and how finely it is modelled.
-    limits, calibration : mapping of str to number
-        Entries of `hapticrender.touch.device_profile.Limits` and `Calibration`.
-    source : str
-        Which profile the parameters are from, by whom and when; named where a run contradicts it.
-    rendering : mapping of str to number, str or bool
-        Settings of the renderer, such as ``velocity_per_force`` or ``crossover``.
-    touch_panel : mapping of str to number
-        Parameters of the `TouchPanel` that senses the finger on a simulated device, such as ``{"rate": 120.0}``; none
-        given: the position is known without error.
-    duration : float, s
-        > 0 and <= 360 000 (100 h).
-    method : str
-        Name of the control method.
-    tolerance : float
-        Relative amplitude error to be judged by, > 0 and <= 1 (0.05 is 5 %).  The default of 0.1 lies under every just
-        noticeable difference (2.2 dB of amplitude, Israr et al. 2006).
-    settle : float, s
-        Left out of the judgement at the beginning, >= 0; of a scene shorter than twice this the last half is judged.
-    keep_unfelt : bool
-        Whether bands below the safe detection threshold are rendered all the same, as by default; left out, they are
-        still part of what the verdict compares with.
-    gradient : float, 1/m
-        Growth of the target amplitude along the surface, as a share of itself, from its middle on; -1000 to 1000.
-        Only on a plate with two coils.
-    seed : int
-        Of the simulated sensor noise, >= 0.
-    name : str
-        Also names files: 1 to 100 printable characters.
+    Notes
+    -----
+    What a scene states of a device goes before what its profile's file does.  Of a scene shorter than twice `settle`
+    the last half is judged.  The default `tolerance` lies under every just noticeable difference (2.2 dB of amplitude,
+    Israr et al. 2006).  Bands that are left out are still part of what the verdict compares with.  A `gradient` takes a
+    plate with two coils.
 
     Examples
     --------
@@ -145,24 +124,26 @@ class Scene(Validated):
     True
     """
 
-    texture: Texture
-    finger: Finger = field(default_factory=Finger.absent)
-    device: str = checked(checks.name, "vt-plate")
-    profile: Mapping[str, Value] = mapping(_read_table)
-    limits: Mapping[str, Value] = mapping(_read_table)
-    calibration: Mapping[str, Value] = mapping(_read_table)
-    source: str = checked(checks.text, "")
-    simulation: Mapping[str, Value] = mapping(_read_table)
-    rendering: Mapping[str, Value] = mapping(_read_table)
-    touch_panel: Mapping[str, Value] = mapping(_read_table)
-    duration: float = parameter(unit="s", above=0, most=LONGEST_TIME)
-    method: str = checked(checks.name, defaults.METHOD)
-    tolerance: float = parameter(0.1, "(a share: 0.05 is 5 %)", above=0, most=1)
-    settle: float = parameter(1.0, "s", most=LONGEST_TIME)
-    keep_unfelt: bool = checked(checks.flag, True)
-    gradient: float = parameter(0.0, "1/m", least=-1e3, most=1e3)
-    seed: int = parameter(0)
-    name: str = checked(checks.name, "scene")
+    texture: Texture = checked(_texture, about="what is played: see `TEXTURES`, or any ``protocols.Texture``")
+    finger: Finger = checked(_finger, Finger.absent(), about="none by default; a texture along the surface needs one")
+    device: str = checked(checks.name, "vt-plate", about="name of a renderer, or file (.toml) of a `DeviceProfile`")
+    profile: Mapping[str, Value] = mapping(_read_table, "parameters of the device that the controller is designed for")
+    limits: Mapping[str, Value] = mapping(_read_table, "entries of `hapticrender.touch.device_profile.Limits`")
+    calibration: Mapping[str, Value] = mapping(_read_table, "entries of `Calibration` beside it")
+    source: str = checked(checks.text, "", about="which profile the parameters are from, by whom and when")
+    simulation: Mapping[str, Value] = mapping(_read_table, "parameters in which a simulated device differs, its level")
+    rendering: Mapping[str, Value] = mapping(_read_table, "settings of the renderer, such as ``crossover``")
+    touch_panel: Mapping[str, Value] = mapping(_read_table, "parameters of a `TouchPanel` in simulation; empty: none")
+    duration: float = parameter(unit="s", about="length", above=0, most=LONGEST_TIME)
+    method: str = checked(checks.name, defaults.METHOD, about="name of the control method")
+    tolerance: float = parameter(0.1, "(a share: 0.05 is 5 %)", "relative error to be judged by", above=0, most=1)
+    settle: float = parameter(1.0, "s", "left out of the judgement at the beginning", most=LONGEST_TIME)
+    keep_unfelt: bool = checked(
+        checks.flag, True, about="whether bands below the safe detection threshold are rendered"
+    )
+    gradient: float = parameter(0.0, "1/m", "growth of the target along the surface, over it", least=-1e3, most=1e3)
+    seed: int = parameter(0, about="of the simulated sensor noise")
+    name: str = checked(checks.name, "scene", about="also names files: 1 to 100 printable characters")
 
     def __post_init__(self) -> None:
         if str(self.device).endswith(ENDING):  # its profile has what the scene does not state
@@ -175,11 +156,6 @@ class Scene(Validated):
         super().__post_init__()
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         self.panel  # noqa: B018 (it refuses what is no touch panel)
-        bound = "a texture with bands(rate) and waveform(time, position)"
-        known = isinstance(self.texture, Texture) and not isinstance(self.texture, type)
-        checks.require(known, "texture", self.texture, bound, TypeError)
-        _refuse_fingers(self.finger)
-        checks.require(isinstance(self.finger, Finger), "finger", self.finger, "a Finger", TypeError)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
             raise ValueError("finger.motion = 'none': a texture over position needs a finger")
 
@@ -320,14 +296,9 @@ def _read_kind(table: Any, key: str, choice: str, kinds: Kinds, folder: Path, ex
         return kind(**values)
 
 
-def _refuse_fingers(finger: Any) -> None:
-    """Refuse several fingers: a device senses the sum of all touches, and the law has one finger's model."""
-    if isinstance(finger, list | tuple):
-        raise ValueError(f"finger: {len(finger)} fingers are stated: must be one, a device renders for one finger")
-
-
 def _read_finger(table: Any, folder: Path) -> Finger:
-    _refuse_fingers(table)
+    if isinstance(table, list):
+        _finger("finger", table)
     own = [entry.name for entry in fields(Finger) if entry.name != "motion"]
     motion = _read_kind(table, "finger", "motion", MOTIONS, folder, extra=own)
     values = {key: table[key] for key in own if key in table}

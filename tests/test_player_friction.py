@@ -1,0 +1,144 @@
+"""What fails in live play on screens, ultrasonic surfaces and hybrids: the drive of the device itself is zero."""
+
+import copy
+import signal
+import time
+
+import numpy as np
+import pytest
+from electroadhesive import Screen
+from live_devices import slide
+from test_hybrid import bench
+from test_ultrasonic_rendering import watched
+
+import hapticrender as hr
+
+START = 0.2  # s: when it fails
+HANG = 0.1  # s
+REST, ZERO = 0.15, 10e-3  # s
+FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
+TEXTURE = hr.Grating(frequency=100.0, velocity=10e-3)  # on a hybrid both parts play it
+KINDS = {
+    "electroadhesion": lambda: Screen(blind=False, finger=FINGER),
+    "ultrasonic": lambda: watched(FINGER),
+    "hybrid": bench,
+}
+
+
+class Queued(Screen):
+    """A screen like a sound card: `play` is three blocks later than a callback, for which `live` makes the driver."""
+
+    def __init__(self):
+        super().__init__(blind=False, block=26, finger=FINGER, rate=20_000.0)
+        self.delay, self.waiting = 4 * self.block, [np.zeros((self.block, 1))] * 3
+
+    def _play(self, drive):
+        self.waiting.append(drive.copy())
+        return super()._play(self.waiting.pop(0))
+
+    def live(self):
+        live = copy.copy(self)
+        live.delay = self.block
+        return live
+
+
+def test_a_screen_on_a_card_is_designed_for_the_delay_of_play():
+    """As for `render`: designed for that of the callback, which it has not, the loop was off by 1.8 to 3 times."""
+    with hr.Player("electroadhesion", Queued(), paced=False) as player:
+        player.finger(-0.03, 0.08, 0.4)
+        player.play(TEXTURE)
+        slide(player, 0.8, start=-0.03, speed=0.08)
+        [band] = player.state().bands
+        assert player._loop.model.delay == 4 * 26
+    assert band.error < 0.05
+
+
+def unplug(sensed):
+    raise hr.DeviceLost("bench: play: no answer")
+
+
+FAULTS = {  # what is sensed then, and what is raised
+    "dead": (lambda sensed: 0.0 * sensed, hr.DeviceFault, "one value repeats|the friction jumped"),
+    "no numbers": (lambda sensed: np.nan * sensed, hr.DeviceFault, "are no numbers"),
+    "gain of 3": (lambda sensed: 3.0 * sensed, hr.DeviceFault, "the drive stayed above|jumped|does not follow"),
+    "application hangs": (lambda sensed: sensed, hr.WatchdogTimeout, f"for {HANG} s"),
+}
+
+
+def failing(kind, spoil=lambda sensed: sensed, at=START):
+    """A device whose sensors fail at a time (s); it hands over nothing else, and is not probed."""
+    device = KINDS[kind]()
+
+    def tell(sample, sensed):
+        values = sensed.sensed if sample < at * device.rate else spoil(sensed.sensed)
+        return sensed._replace(sensed=values, motion=None, position=None)
+
+    device.tell, device.probe = tell, False
+    return device
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_stop_leaves_the_device_itself_without_drive(kind, fault):
+    """While the application hangs; zero drive of the controller would be the bias of a screen, or of a vibration."""
+    spoil, error, cause = FAULTS[fault]
+    device, hangs = failing(kind, spoil), error is hr.WatchdogTimeout
+    played, watchdog = [], HANG if hangs else np.inf
+
+    def hang(player):
+        player.play(TEXTURE)
+        slide(player, START, speed=0.08)
+        player._advance(REST)
+        played.extend(device.played)
+        player.sleep(0.1)
+
+    with pytest.raises(error, match=cause), hr.Player(kind, device, paced=False, watchdog=watchdog) as player:
+        hang(player)
+    drive, at = abs(np.concatenate(played)), round((START + hangs * HANG) * device.rate)
+    assert drive[at - round(ZERO * device.rate) : at].max(axis=0).all()
+    assert len(drive) >= (START + REST) * device.rate
+    assert not drive[at + round(ZERO * device.rate) :].any()
+
+
+def interrupt():
+    signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize(("end", "error"), [(lambda: 1 // 0, ZeroDivisionError), (interrupt, KeyboardInterrupt)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_ends_an_application_leaves_the_device_itself_without_drive(kind, end, error):
+    """Within 10 ms of signal."""
+    device, before = failing(kind), []
+
+    def live(player):
+        player.play(TEXTURE)
+        slide(player, HANG, speed=0.08)
+        before.extend(device.played)
+        end()
+
+    with pytest.raises(error), hr.Player(kind, device, paced=False) as player:
+        live(player)
+    after = np.concatenate(device.played[len(before) :])
+    assert 0 < len(after) <= ZERO * device.rate
+    assert not after[-1].any()
+
+
+@pytest.mark.parametrize("kind", ["electroadhesion", "hybrid"])
+def test_a_driver_that_fails_is_left_without_drive_at_once(kind):
+    """Before the application has called anything; so is one that is unplugged, where it can be reached again."""
+    device = failing(kind, unplug, HANG)
+    failed = []
+
+    def hang(player):
+        player.play(TEXTURE)
+        player.finger(0.0, 0.08, 0.4)
+        end = time.monotonic() + 60.0
+        while player._error is None and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        failed.extend(device.played)
+        player.state()
+
+    with pytest.raises(hr.DeviceLost, match="no answer"), hr.Player(kind, device) as player:
+        hang(player)
+    assert not failed[-1].any()
