@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 4
+VERSION = 5
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
