@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from binascii import crc32
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -57,19 +57,21 @@ class BoardTexture:
     Its table reaches from end to end of the surface, and has at most `board.points`; in between the board takes cubic
     interpolation, whose error for a sine of wavelength L at steps h is (3/128)(2 pi h/L)^4: 0.2 % at 12 points a
     wavelength, 10 % at 4.4.  Samples are rounded to 1/32767 of the largest of their frame.  A ValueError where the
-    texture is too fine for the table, or not the same when it is evaluated twice.
+    texture is too fine for the table, or not the same when it is evaluated twice.  `waveform_of` makes the texture's
+    waveform in the device's quantity; by default it has its own.
     """
 
-    def __init__(self, texture: Texture, board: Capabilities, model: DeviceModel) -> None:
+    def __init__(self, texture: Texture, board: Capabilities, model: DeviceModel, waveform_of: Any = None) -> None:
         self.rate, self.lookahead = board.rate, board.lookahead
         self.written, self._number, self._name = 0, 0, type(texture).__name__
         self._start, self._step, self._table = 0.0, 1.0, np.zeros(0)
         try:
-            self.parts: SeparatedTexture | None = SeparatedTexture(texture)
+            self.parts: SeparatedTexture | None = SeparatedTexture(texture, waveform_of)
             self.timed = self.parts.timed
         except InseparableTexture:
             self.parts, self.timed = None, True
-            self._waveform = evaluated(self._name, texture.bands(board.rate), texture.waveform)
+            waveform = waveform_of(texture) if waveform_of else texture.waveform
+            self._waveform = evaluated(self._name, texture.bands(board.rate), waveform)
         self._blend = 0 if self.parts else BLEND
         self._ahead = min(round((AHEAD if self.parts else EVALUATED) * board.rate), board.ring - 2 * ROWS)
         if self.parts and self.parts.spatial:
