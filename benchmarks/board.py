@@ -129,10 +129,10 @@ def flash_of(folder, more):
     return sum(int(line.split()[0]) + int(line.split()[1]) for line in sizes.splitlines()[1:])
 
 
-def measure(name, texture, *options):
+def measure(name, texture, *options, **device):
     """Print the row of a texture; RAM and flash are those of the law alone, or with its supervisor."""
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.4)
-    rendering = hr.prepare(hr.Scene(texture=texture, finger=finger, duration=1.0, keep_unfelt=True))
+    rendering = hr.prepare(hr.Scene(texture=texture, finger=finger, duration=1.0, keep_unfelt=True, **device))
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         export(rendering, folder, bands=max(len(rendering.bands), 1))
@@ -158,6 +158,7 @@ def main():
     for name, texture in textures().items():
         measure(name, texture)
     measure("8 bands, supervised", textures()["8 bands"], "-DSUPERVISED")
+    measure("screen, waveform", White(), device="electroadhesion", profile={"rate": 5e3})
     return 0
 
 

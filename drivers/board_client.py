@@ -13,7 +13,7 @@ from hapticrender.checks import integer, number, require
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
-from hapticrender.drivers.board_texture import BoardTexture
+from hapticrender.drivers.board_texture import BoardTexture, Pointed
 from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Telemetry
 from hapticrender.drivers.rows import Rows
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
@@ -164,7 +164,7 @@ class BoardClient(OpenedInWith):
         time = self.clock.monotonic() if time is None else time
         if self._line is None and self._error is None and self._runs:
             return  # the board is being looked for
-        self._open_line().finger = time, float(position), float(velocity), float(load)
+        self._open_line().finger = Pointed(time, float(position), float(velocity), float(load))
 
     @property
     def gain(self) -> float:
@@ -214,8 +214,7 @@ class BoardClient(OpenedInWith):
         stream : int
             Samples between two rows that the board streams back; 0: none.
         telemetry : float, s
-            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz; at most 0.1 s with a texture, of which as
-            much is sent as has been played by the telemetry.
+            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
         """
         period = round(telemetry * self.capabilities.rate)
         start = integer("stream", stream, "samples", least=0, most=0xFFFF), period
@@ -231,7 +230,7 @@ class BoardClient(OpenedInWith):
             line.play(texture)
         sample = line.begin(Kind.START, *start)
         if texture is not None:
-            texture.began = sample
+            texture.begin(sample, self.clock.monotonic())
         return sample
 
     def stop(self) -> None:

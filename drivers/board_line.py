@@ -5,7 +5,7 @@ import secrets
 import time
 from binascii import crc32
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -13,8 +13,8 @@ import serial
 
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.board_texture import ROWS, BoardTexture
-from hapticrender.drivers.protocol import WRAP, Capabilities, Frame, Kind, Reason, Stream, Telemetry
+from hapticrender.drivers.board_texture import LIFTED, BoardTexture
+from hapticrender.drivers.protocol import Capabilities, Frame, Kind, Reason, Stream, Telemetry
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
 BAUD = 230_400  # of a UART; a board on USB or a pseudo-terminal does not care
@@ -27,8 +27,6 @@ MICROSECOND = 1e-6  # s: times that differ by less are the same
 RESEND = 0.03  # s after which a command without a reply is sent again
 FOREIGN = 3  # replies for another session in a row after which ours has ended
 MOST_STREAM = 4096  # frames of the stream that wait for the caller
-
-Finger = tuple[float, float, float, float]  # time (s), position (m, NaN: lifted), velocity (m/s), load (N)
 
 
 class Line(NamedTuple):
@@ -93,7 +91,7 @@ class BoardLine:
         self._nonce, self.session = secrets.randbelow(2**32 - 1) + 1, 0  # apart from earlier ones; 0: not greeted
         self.telemetry: Telemetry | None = None
         self.streamed: deque[Stream] = deque(maxlen=MOST_STREAM)
-        self.finger: Finger | None = None  # not sent yet
+        self.finger = self._pointed = LIFTED  # as it was set; as it was sent
         self.application = 0, 0  # changes with every call of it; ms without one after which the board stops, 0: never
         self._began = self._received = clock.monotonic()  # s; of the last valid frame
         self._kept_alive = -math.inf  # s
@@ -179,25 +177,29 @@ class BoardLine:
         """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
         self._textures = (self._textures + 1) % 256
         none = protocol.pack(Kind.TEXTURE, self._textures, 0, 0, 0.0, 0.0, 0.0)
-        silence = (Kind.TEXTURE, none), (Kind.PLAY, protocol.pack(Kind.PLAY, crc32(none)))
-        for kind, payload in silence if texture is None else texture.frames(self._textures):
+        frames: Iterable[tuple[Kind, bytes]]
+        frames = (Kind.TEXTURE, none), (Kind.PLAY, protocol.pack(Kind.PLAY, crc32(none)))
+        if texture is not None:
+            frames = texture.frames(self._textures, self.clock.monotonic(), self.finger)
+        for kind, payload in frames:
             request = self._patiently(kind, payload)
             if meanwhile is not None:
                 self.supply(meanwhile)
         if texture is not None:
-            texture.began = (request.sample + self.capabilities.lookahead) % WRAP
+            ahead = self.capabilities.lookahead
+            texture.begin(request.sample + ahead, self.clock.monotonic() + ahead / self.capabilities.rate)
 
     def supply(self, texture: BoardTexture) -> None:
-        """Send a frame of the samples that come next, where they are due; a board at rest takes none."""
-        now = self.telemetry
-        played = 0 if now is None or texture.began is None else (now.sample - texture.began) % WRAP
-        samples = texture.samples(played if played < WRAP // 2 else 0)
+        """Send the frame of samples that is due; a board at rest takes none."""
+        sent = self.clock.monotonic()
+        samples = texture.samples(sent, self._pointed)
         if samples is None:
             return
         request = self.request(Kind.SAMPLES, samples)
+        texture.arrived(request.sample, sent, self.clock.monotonic())
         if request.refused != Reason.STATE:
             self._checked(request)
-            texture.written += ROWS
+            texture.taken()
 
     def identify(self, lines: Sequence[Line], samples: int, stride: int) -> int:
         """Start a multisine, or without lines a queue; return the sample at which it began."""
@@ -235,10 +237,11 @@ class BoardLine:
             request.sent = now
             out += protocol.command(self.session, request.kind, request.sequence, request.payload)
         since = now - self._kept_alive + MICROSECOND
-        if self.session and since >= (KEEP_ALIVE if self.finger is None else FINGER_PERIOD):
-            self._kept_alive, finger, self.finger = now, self.finger, None
-            time = round(((now if finger is None else finger[0]) - self._began) * 1e6) & 0xFFFFFFFF
-            kind, fields = (Kind.HEARTBEAT, ()) if finger is None else (Kind.FINGER, finger[1:])
+        moved = self.finger is not self._pointed
+        if self.session and since >= (FINGER_PERIOD if moved else KEEP_ALIVE):
+            self._kept_alive, self._pointed = now, self.finger
+            time = round(((self.finger.time if moved else now) - self._began) * 1e6) & 0xFFFFFFFF
+            kind, fields = (Kind.FINGER, self.finger[1:]) if moved else (Kind.HEARTBEAT, ())
             payload = protocol.pack(kind, time, *self.application, *fields)
             out += protocol.command(self.session, kind, self._next(), payload)
         self.sent_bytes += len(out)

@@ -27,11 +27,11 @@ class BoardLoop:
     """
 
     senses = False  # the host sends the finger's position
-    motion_source = "sensors"
 
     def __init__(self, rendering: Rendering, driver: SerialDriver) -> None:
         self.rendering, self.driver, self.model = rendering, driver, rendering.model
         self.samples, self.flags = 0, Flag(0)
+        self.motion_source = "sensors" if driver.sensed_channels else "unknown"
         self._client = client = driver.client
         self.finger, self.watch, self.alive, self.silence = client.finger, client.watch, client.beat, client.stop
         self._bands, self._texture = self.made(rendering)
@@ -78,7 +78,8 @@ class BoardLoop:
         found = self.driver.signals(self._client.rows())
         first, count = self.samples, len(found["flags"])
         self.samples += count
-        motion = found["sensed"] @ self.model.place_from_sensed.T
+        senses = self.driver.sensed_channels > 0
+        motion = found["sensed"] @ self.model.place_from_sensed.T if senses else np.full((count, 1), np.nan)
         recent = np.vstack([self._recent, np.stack([found["reference"], motion[:, 0], found["position"]], axis=1)])
         self._recent = recent[-round(JUDGED * self.driver.rate) :]
         return first, {**found, "motion": motion, "target": np.zeros((count, 0), complex)}
@@ -106,8 +107,11 @@ class BoardLoop:
 
 
 def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
-    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse."""
+    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse.
+
+    A screen plays all as textures: its law makes friction of a waveform's derivative.
+    """
     bands, texture = rendering.bands, rendering.scene.texture
-    if bands.envelope is not None and len(bands) and not bands.modulated:
+    if bands.envelope is not None and len(bands) and not (bands.modulated or board.friction):
         return bands, None
-    return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model)
+    return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model, rendering.waveform_of)

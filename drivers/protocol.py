@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 4
+VERSION = 5
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
@@ -63,7 +63,7 @@ LAYOUT = {  # payloads, without the check value of commands; some go on with row
     Kind.PROFILE: "<H",  # number of the first point; then points, i16
     Kind.SAMPLES: "<BIf",  # number of the texture; of the first sample; m per unit; then samples, i16
     Kind.PLAY: "<I",  # CRC-32 of TEXTURE and all points
-    Kind.CAPABILITIES: "<BIIfffIHHBBBBBHHB",
+    Kind.CAPABILITIES: "<BIIfffIHHBBBBBHHBB",
     Kind.ACK: "<BI",  # kind; sample
     Kind.REFUSE: "<BBI",  # kind; reason; sample
     Kind.TELEMETRY: "<IIIIBBHIIIIIfIBB",
@@ -145,6 +145,7 @@ class Capabilities(NamedTuple):
     ring: int  # samples of a texture that it holds
     points: int  # of a texture's profile, at most
     lookahead: int  # samples after PLAY with which a texture begins
+    friction: int  # 1: it drives the carrier of a screen, and textures are impulses (N s); 0: a plate
 
 
 class BandTelemetry(NamedTuple):

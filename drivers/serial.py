@@ -49,7 +49,7 @@ class SerialDriver(BaseDriver):
         Of `BoardClient`.
     """
 
-    device_kind = "vt-plate"  # of which the firmware has the law
+    device_kind: str  # of which the firmware has the law
     play_delay: int  # samples, of a copy that plays the drive of the host
 
     def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
@@ -59,6 +59,7 @@ class SerialDriver(BaseDriver):
         with self.client as client:
             found = self.capabilities = client.capabilities
             self.drive_limit = found.drive_limit
+            self.device_kind = "electroadhesion" if found.friction else "vt-plate"
         super().__init__(
             rate=found.rate,
             drive_channels=found.drive_channels,
@@ -120,7 +121,7 @@ class SerialDriver(BaseDriver):
                 f"{self}: device_loop: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
         bands, texture = playable(rendering, self.capabilities)
-        if texture is not None and inner.n_bands:
+        if texture is not None and inner.n_bands and not self.capabilities.friction:
             raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
@@ -128,13 +129,21 @@ class SerialDriver(BaseDriver):
                 self.protect(rendering)
                 self._begin(bands, texture)
             found = self.signals(self.client.rows(count, self._point))
-            envelope = np.zeros(0) if bands.envelope is None else bands.envelope
-            target = np.tile(np.asarray(envelope, complex), (count, 1))
-            target[np.isnan(found["position"])[:, None] & (bands.wavenumber > 0.0)] = 0.0
+            target = self._targets(rendering, found["position"])
             names = ("sensed", "position", "normal_load", "flags")
             return found["drive"], target, found["flags"], Sensed(**{name: found[name] for name in names})
 
         return advance
+
+    def _targets(self, rendering: Rendering, position: Array) -> Array:
+        """Envelopes of the scene's bands (n, bands), for a finger at `position` (m, shape (n,))."""
+        bands, away = rendering.bands, np.isnan(position)[:, None]
+        envelope = np.zeros(0) if bands.envelope is None else bands.envelope
+        target = np.tile(np.asarray(envelope, complex), (len(position), 1))
+        if bands.differentiated:
+            speed = np.diff(position, prepend=position[:1]) * self.rate
+            target *= 2j * np.pi * (bands.frequency + np.multiply.outer(speed, bands.wavenumber))
+        return np.where(away & ((bands.wavenumber > 0.0) | bool(self.capabilities.friction)), 0.0, target)
 
     def loop(self, rendering: Rendering) -> BoardLoop:
         """Return a loop of the board's own for live play, see `hapticrender.Player`."""

@@ -1,18 +1,23 @@
 """Export a scene's controller for a microcontroller: tables of the design in C, beside copies of the portable sources.
 
-The sources are those of ``drivers/firmware``; they play what method ``inverse`` designs for a plate.
+The sources are those of ``drivers/firmware``; they play what method ``inverse`` designs for a plate, and for an
+electroadhesive screen without sensors, whose drive is the peak of a carrier that the board's hardware makes.
 """
 
 import math
+from copy import copy
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hapticrender.bands import Bands
 from hapticrender.control.controller import lowest_carrier, spacing
 from hapticrender.control.inverse import WaveformController
 from hapticrender.control.kernel import CONFIDENCE_FADE
+from hapticrender.loop import prepare
 from hapticrender.protocols import Rendering
 
 MOST_BANDS, MOST_DELAY = 64, 64  # bands; samples
@@ -20,8 +25,9 @@ BANDS = 8  # of a board at least: set-points may need more than the scene does
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
-BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES, PAST_BYTES = 12_584, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
+BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 24, "CHANNELS": 4136}  # of board_t, each
+OTHER_BYTES, PAST_BYTES = 12_640, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
+SCREEN = "electroadhesion"
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
@@ -54,6 +60,10 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
     sources that were changed since they were written.  A ValueError where the board cannot play the scene, or a file of
     `folder` would be overwritten that is not as it was written.
     """
+    if rendering.scene.device == SCREEN:
+        board: Any = copy(rendering.device)
+        board.sensed_channels = 0
+        rendering = prepare(rendering.scene, driver=board, compiled=False)
     sizes, design = board_design(rendering, bands)
     texts = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     for name, text in {} if force else {**texts, "design.h": GENERATED, "design.c": GENERATED}.items():
@@ -86,27 +96,33 @@ def sources() -> list[Path]:
 
 def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
     """Return sizes (in design.h) and fields of `design_t` for a rendering's controller; see `export` for the errors."""
-    controller: Any = rendering.controller()
+    screen, used = rendering.scene.device == SCREEN, rendering.bands
+    if screen and rendering.design and rendering.scene.method == "inverse":  # whatever it plays is a waveform
+        used = replace(Bands.none(spatial=False), differentiated=True)
+        controller: Any = rendering.design(used)
+    else:
+        controller = rendering.controller()
     controller = getattr(controller, "controller", controller)  # without its supervisor
-    most = _checked(rendering, controller, bands)
+    most = _checked(rendering, used, controller, bands)
     settings, law, model = controller.settings, controller.law, rendering.model
     sensors, channels, taps = (int(settings[name]) for name in ("sensors", "channels", "n_taps"))
     sizes = {
         "BANDS": most,
         "DELAY": int(law["delay"]),
         "COORDINATES": int(settings["coordinates"]),
-        "SENSORS": sensors,
+        "SENSORS": max(sensors, 1),  # an array of none is no C
         "CHANNELS": channels,
         "DAMPER_TAPS": taps,
+        "FRICTION": int(screen),
     }
-    lowest, period = lowest_carrier(model, rendering.bands), 1.0 / model.rate
-    measuring = min(MEASURING, lowest / 2, spacing(rendering.bands) / (2 * math.pi))
+    lowest, period = lowest_carrier(model, used), 1.0 / model.rate
+    measuring = min(MEASURING, lowest / 2, spacing(used) / (2 * math.pi))
     fields: dict[str, Any] = {
         "rate": float(model.rate),
         "delay": int(law["delay"]),
         "lookahead": controller.lookahead,
         "most_bands": most,
-        "bands_used": len(rendering.bands),
+        "bands_used": len(used),
         "spatial": int(law["spatial"]),
         "learns": int(law["learns"]),
         **{name: settings[name] for name in _CONTROLLER},
@@ -120,15 +136,30 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
         "measuring": 4 * math.pi * measuring * period,
         "measuring_dc": 2 * math.pi * min(MEASURING_DC, lowest / 8) * period,
     }
-    fields["coordinate_from_sensor"] = fields["coordinate_from_sensor"][:, :sensors]
+    fields["coordinate_from_sensor"] = fields["coordinate_from_sensor"][:, : sizes["SENSORS"]]
     fields["drive_from_force"] = fields["drive_from_force"][:channels]
-    if len(rendering.bands):
-        fields["bands"] = rendering.bands.set_points()
-    return sizes, fields
+    if len(used):
+        fields["bands"] = used.set_points()
+    return sizes, fields | (_friction(rendering, settings) if screen else {})
+
+
+def _friction(rendering: Rendering, settings: Any) -> dict[str, Any]:
+    """Return the fields of `design_t` that a screen has beside those of a plate."""
+    root = rendering.shape
+    return {
+        "contact_length": settings["contact_lag"],
+        "typical_speed": settings["typical_speed"],
+        "least_speed": settings["least_speed"],
+        "bias": root.bias,
+        "least": root.floor,
+        "attraction": root.gain,
+    }
 
 
 def supervision_table(rendering: Rendering) -> dict[str, Any]:
     """Return the fields of `supervision_t` of a rendering's supervisor."""
+    if not rendering.driver.sensed_channels:
+        return {"sensed_bound": HUGE}  # nothing is sensed, and nothing supervised
     controller: Any = rendering.controller()
     settings, gains = controller.state["p"][0], controller.gains[0]
     return {
@@ -142,17 +173,19 @@ def supervision_table(rendering: Rendering) -> dict[str, Any]:
     }
 
 
-def _checked(rendering: Rendering, controller: Any, bands: int) -> int:
+def _checked(rendering: Rendering, playing: Bands, controller: Any, bands: int) -> int:
     """Most bands of the board; refuses what its law does not play."""
-    scene, model, used = rendering.scene, rendering.model, len(rendering.bands)
-    if scene.device != "vt-plate":
-        raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate only")
+    scene, model, used, root = rendering.scene, rendering.model, len(playing), rendering.shape
+    if scene.device not in ("vt-plate", SCREEN):
+        raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate and {SCREEN} only")
+    if root and (root.straight or getattr(rendering.driver, "hold", 0)):
+        raise ValueError("render: a board plays the envelope of a carrier by its square root, without other settings")
     if scene.method != "inverse":
         raise ValueError(f'method = {scene.method!r}: a board plays "inverse" only, the default')
     if not isinstance(controller, WaveformController):
         playable = "a whole waveform, without `carriers`, or bands of constant amplitude up to 0.24 of the rate"
         raise ValueError(f"texture {type(scene.texture).__name__}: a board plays {playable}")
-    if rendering.bands.modulated or rendering.bands.differentiated:
+    if not root and (playing.modulated or playing.differentiated):
         raise ValueError("the target is modulated, or a velocity: a board plays displacements of constant amplitude")
     if model.delay > MOST_DELAY:
         raise ValueError(f"delay = {model.delay} samples: must be <= {MOST_DELAY} on a board")

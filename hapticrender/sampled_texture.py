@@ -10,7 +10,6 @@ over what it replaces.
 """
 
 import ctypes
-from functools import partial
 from typing import Any
 
 import numba
@@ -19,7 +18,7 @@ from numba import carray
 
 from hapticrender.jit import F8, Addressed, call, entry, kernel, pointer, record, record_of, swap
 from hapticrender.protocols import Array, Rendering, Texture
-from hapticrender.touch.composed import PLACES, SOON, SeparatedTexture
+from hapticrender.touch.composed import SeparatedTexture, evaluated
 
 AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is later the texture fades out
 CHUNK = 4096  # samples computed at once
@@ -175,10 +174,7 @@ class EvaluatedTexture(Addressed):
 
     def _prepare(self, rendering: Rendering, length: int) -> None:
         bands, name = rendering.bands, type(rendering.scene.texture).__name__
-        self._waveform = partial(bands.checked, name, rendering.waveform)
-        tried = np.repeat(SOON, len(PLACES)), np.tile(PLACES, len(SOON))
-        if (self._waveform(*tried) != self._waveform(*tried)).any():
-            raise ValueError(f"{name}: must not change with a reading")
+        self._waveform = evaluated(name, bands, rendering.waveform)
         self._rate, self._follows, self._samples = rendering.driver.rate, bands.follows_finger, np.zeros(length)
         self.control: Any = None  # keeps the controller that plays it alive
 

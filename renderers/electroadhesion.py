@@ -96,7 +96,12 @@ class ElectroadhesionRenderer(FrictionRenderer):
         return ElectroadhesionScreen(parameters, setup.scene.finger, seed, setup.compensation)
 
     def connect(self, setup: ScreenSetup, driver: Driver) -> Driver:
-        """Return `driver` behind the square root: it gets the current's envelope (A, peak), or the carrier."""
+        """Return `driver` behind the square root: it gets the current's envelope (A, peak), or the carrier.
+
+        One with the law of a screen on it has the square root, too.
+        """
+        if getattr(driver, "device_kind", "") == self.name:
+            return driver
         if setup.settings.output == "envelope":
             return ShapedDriver(driver, setup.compensation)
         carrier, rate = setup.assumed.carrier_frequency, setup.assumed.rate

@@ -23,7 +23,8 @@ from waves import Own
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.drivers import protocol
-from hapticrender.drivers.board_texture import AHEAD, COARSE, ROWS, BoardTexture
+from hapticrender.drivers.board_line import FINGER_PERIOD
+from hapticrender.drivers.board_texture import AHEAD, BLEND, COARSE, LIFTED, ROWS, SPARE, BoardTexture
 from hapticrender.drivers.protocol import Cause, Kind, Reason, State
 from hapticrender.errors import DriverError, WatchdogTimeout
 from hapticrender.mathx import smoothstep
@@ -90,7 +91,7 @@ def test_a_board_that_starves_fades_out_and_plays_nothing_stale(stepped):
     """The host sends nothing for a second, half a second more than it had sent ahead, then goes on."""
     client, texture = streaming(stepped, Own(two_tones))
     stepped.run(client, 0.4)
-    texture.samples, samples = lambda played: None, texture.samples
+    texture.samples, samples = lambda now, finger: None, texture.samples
     last = texture.written
     stepped.run(client, 1.0)
     texture.samples = samples
@@ -120,7 +121,7 @@ def test_only_what_was_sent_plays(stepped):
     line = client._line
     never_described = protocol.pack(Kind.PLAY, 0)
     assert line.request(Kind.PLAY, never_described).refused == Reason.STATE
-    frames = list(BoardTexture(sine(2e-3), client.capabilities, MODEL).frames(200))
+    frames = list(BoardTexture(sine(2e-3), client.capabilities, MODEL).frames(200, 0.0, LIFTED))
     (_, described), *points, play = frames
     line.send(Kind.TEXTURE, described)
     for kind, payload in points[:-1]:
@@ -195,6 +196,104 @@ def test_what_the_samples_take_of_the_line_is_what_the_page_says(stepped):
     # a frame more or less in two seconds; signs of life come up to 1 ms late, as a command is waited for in between
     assert (client._line.sent_bytes - before) / 2.0 - 1900 == pytest.approx(11_600, abs=74 + 0.1 * 1900)
     assert "| 11 600 |" in (ROOT / "docs" / "protocol.md").read_text(encoding="utf-8")
+
+
+WAVELENGTH, HERTZ, SPEED = 1e-3, 70.0, 0.05  # m, Hz, m/s
+STEP, PERIOD = 1e-3, 0.01  # s: of the line below; between two settings of the finger
+
+
+def wandering(time, position):
+    """Ridges that wander: a function of time and position at once."""
+    return 4e-6 * np.sin(2 * np.pi * (HERTZ * time + np.nan_to_num(position) / WAVELENGTH))
+
+
+def turning(time):
+    """Position (m) of a finger that turns after 0.8 s."""
+    return SPEED * (0.3 - abs(time - 0.8))
+
+
+def slid(board, texture, seconds):
+    """Rows of a board whose finger turns, position (m) and time (s) of each, and the texture."""
+    (client, found), due = streaming(board, texture), 0.0
+    while board.time < seconds:
+        if board.time >= due:
+            velocity = turning(board.time + 1e-6) - turning(board.time)
+            client.finger(turning(board.time), 1e6 * velocity, 0.4)
+            due = board.time + PERIOD
+        client.step()
+        board.sleep(STEP)
+    rows = client.rows()
+    clock = board.time - (board.sample - client.started - np.arange(len(rows))) / RATE
+    return rows, turning(clock), clock, found
+
+
+def test_a_texture_in_time_and_place_at_once_is_that_of_where_the_finger_is(stepped):
+    """Both sides: while the finger goes on as it did, and late where it turns; and never a step."""
+    rows, position, clock, found = slid(stepped, Own(wandering), 1.6)
+    texture = wandering(np.arange(len(rows)) / RATE, position)
+    off = abs(rows[:, 6] - texture)
+    # the clocks are known to half the step between sending a frame and reading its reply
+    known = 4e-6 * 2 * np.pi * SPEED / WAVELENGTH * STEP / 2
+    # until it is set, which may wait for a frame that is under way, and sent; until its frame is there; then the fade
+    late = PERIOD + STEP + FINGER_PERIOD + STEP + (found._late + SPARE + found.lookahead + BLEND) / RATE
+    turns = (clock > 0.8) & (clock < 0.8 + late)
+    assert off[(clock > 0.3) & ~turns].max() < known
+    assert off[turns].max() > 4e-6 / 2
+    steepest = 4e-6 * (2 * np.pi * (HERTZ + SPEED / WAVELENGTH) / RATE + 2 * 1.5 / BLEND)
+    assert abs(np.diff(rows[:, 6])).max() < steepest
+    assert not rows[:, -1].any()
+
+
+def test_it_is_silent_where_no_finger_is(stepped):
+    """Where it says that it lies along the surface: before the finger touches, and 0.2 s after it was last set."""
+    client, _ = streaming(stepped, Own(wandering, spatial=True, bands=Bands.none(spatial=True)))
+    stepped.run(client, 0.2)
+    client.finger(0.01, 0.0, 0.4)
+    stepped.run(client, 0.6)
+    reference = client.rows()[:, 6]
+    assert not reference[: int(0.2 * RATE)].any()
+    assert abs(reference[int(0.25 * RATE) : int(0.35 * RATE)]).max() > 3.9e-6
+    assert not reference[int((0.2 + 0.2 + 0.01) * RATE) :].any()
+
+
+def test_samples_replace_those_that_have_not_been_played(stepped):
+    """As far back as the ring holds them: what is past stays so, and all others are as they were."""
+    client, texture = streaming(stepped, Own(two_tones))
+    stepped.run(client, 0.1)
+    line, number = client._line, texture._number
+    texture.samples = lambda now, finger: None
+
+    def send(first, count=ROWS):
+        head = protocol.pack(Kind.SAMPLES, number, first % 2**32, 1e-9)
+        return line.request(Kind.SAMPLES, head + np.full(count, 1000, "<i2").tobytes())
+
+    while texture.written < client.capabilities.ring:
+        line.send(Kind.SAMPLES, BoardTexture.samples(texture, stepped.time + 1.0, LIFTED))
+        texture.taken()
+    written = texture.written
+    assert send(written + 1).refused == Reason.STATE
+    assert send(written - client.capabilities.ring - 1).refused == Reason.STATE
+    assert send(written - client.capabilities.ring).refused is None  # its first ones, which are past
+    assert send(1000).refused is None
+    stepped.run(client, 0.2)
+    middle = stepped.sample - client.started - 30  # some of them are past
+    assert send(middle).refused is None
+    stepped.run(client, written / RATE - 0.3)
+    played = np.arange(300, written - 250)  # between its fades
+    reference, expected = client.rows()[played, 6], two_tones(played / RATE)
+    expected[1000 - 300 : 1000 - 300 + ROWS] = 1e-6
+    changed = played[abs(reference - expected) > 1e-9]  # the rest of i16
+    assert 0 < len(changed) <= ROWS - 30 + line.capabilities.lookahead
+    assert middle <= changed[0]
+    assert (np.diff(changed) == 1).all()
+    np.testing.assert_allclose(reference[changed - 300], 1e-6, rtol=1e-6)
+
+
+def test_a_texture_that_differs_when_it_is_read_again_is_refused(stepped):
+    draws = np.random.default_rng(1)
+    noisy = Own(lambda time, position: 1e-6 * draws.standard_normal(len(time)) + 0.0 * position)
+    with pytest.raises(ValueError, match="Own: must not change with a reading"):
+        BoardTexture(noisy, stepped.client().open().capabilities, MODEL)
 
 
 def test_textures_fade_into_each_other(stepped):

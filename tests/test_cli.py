@@ -358,7 +358,7 @@ BAD_ARGUMENTS = [
     (["render", "{tiny}", "--out", "{out}", "--driver", "tea"], "driver 'tea' is not installed: must be one of"),
     (["latency", "--driver", "wavefile:{out}.wav"], "senses nothing: a round trip needs an input"),
     (["latency", "--driver", "audio:no such card"], "audio:"),
-    (["export", "screen-spatial", "--out", "{out}"], "a board plays vt-plate only"),
+    (["export", "ultrasonic-swiping", "--out", "{out}"], "a board plays vt-plate and electroadhesion only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
     (["validate", "--suite", "accuracy", "--jobs", "2"], "--suite runs in one process, and writes --json only"),
     (

@@ -10,7 +10,7 @@ from board import FIRMWARE, ROOT, SOURCES, compile_c
 from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
-from hapticrender.export import export
+from hapticrender.export import SCREEN, export
 
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
@@ -53,12 +53,14 @@ def test_law_and_board_need_no_heap_no_output_and_no_double_on_a_cortex_m4(expor
 
 
 @pytest.mark.parametrize(
-    ("device", "bands"), [({}, 8), ({}, 64), ({"coils": 1}, 9), ({"delay": 3}, 8), ({"rate": 48e3, "delay": 40}, 8)]
+    ("device", "bands"),
+    [({}, 8), ({}, 64), ({"coils": 1}, 9), ({"delay": 3}, 8), ({"rate": 48e3, "delay": 40}, 8), (SCREEN, 8)],
 )
 def test_the_memory_of_a_board_is_what_design_h_states(tmp_path, device, bands):
     """To the byte on a Cortex-M4, and with other textures; a board that takes more does not compile."""
     cross_tools()
-    scene = hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=5e-6), duration=0.1, profile=device)
+    fields = {"device": SCREEN, "finger": FINGERS["slide"]} if device == SCREEN else {"profile": device}
+    scene = hr.Scene(texture=hr.Grating(frequency=60.0, amplitude=5e-6), duration=0.3, **fields)
     export(hr.prepare(scene, compiled=False), tmp_path, bands=bands)
     (tmp_path / "size.c").write_text('#include "board.h"\nchar found[sizeof(board_t)], stated[BOARD_BYTES];\n')
     for sizes in (), ("-DTEXTURE_RING=1024u", "-DTEXTURE_POINTS=2048u"):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from board import SLOW, BoardProcess, SlowClock, build_board, sensed_error
 from live_devices import TONE
-from waves import phasor
+from waves import Own, phasor
 
 import hapticrender as hr
 from hapticrender.drivers.serial import SerialDriver
@@ -16,11 +16,18 @@ from hapticrender.recordings.recording import Recording
 WHITE = hr.Recorded(
     samples=np.random.default_rng(5).standard_normal(20_000), rate=5000.0, gain=10e-6, passband=(30.0, 300.0)
 )
+WANDERING = Own(lambda time, place: 5e-6 * np.sin(2 * np.pi * (60.0 * time + np.nan_to_num(place) / 2e-3)))  # m
 
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
     return build_board(tmp_path_factory.mktemp("board"), hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
+
+
+def error_bound(recording):
+    """Bound of `sensed_error` over the last 0.3 s: 5 %, beside the noise of 0.7 um rms in the middle."""
+    noise = 0.71e-6 * np.sqrt(480 / 2500) / np.std(recording.reference[-1500:])  # within 20-500 Hz
+    return np.hypot(1.13 * noise, 0.05)  # 288 numbers: 13 % are three sigmas of its rms
 
 
 def test_a_board_plays_live(program, tmp_path):
@@ -67,13 +74,40 @@ def test_a_board_plays_live(program, tmp_path):
     # noise of 0.7 um rms in the middle; what is left of the error is below 5 % of the target
     assert white.frequency == 0.0
     assert white.error * white.target < np.hypot(0.75e-6, 0.05 * white.target)
-    # the same noise within 20-500 Hz, 288 numbers over 0.3 s: 13 % are three sigmas of its rms
-    noise = 0.71e-6 * np.sqrt(480 / 2500) / np.std(both.reference[-1500:])
-    found = sensed_error(both, len(both) - 1500)
-    assert found < np.hypot(1.13 * noise, 0.05)
+    assert sensed_error(both, len(both) - 1500) < error_bound(both)
     wanted, moved = (phasor(each[-1500:], 150.0) for each in (recording.reference, recording.motion[:, 0]))
     # 1 um of noise at two ends: 0.7 um sqrt(2/1500) = 0.026 um in each part, three times; the phase needs no fit
     assert max(abs((moved - wanted).real), abs((moved - wanted).imag)) < 0.08e-6
+
+
+def test_a_board_plays_a_texture_in_time_and_place_at_once(program, tmp_path):
+    """Faded into, followed by another, and flagged nowhere; the board's own position is up to a round trip late."""
+    with BoardProcess(program, tmp_path, *SLOW) as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        with hr.Player(driver=driver) as player:
+            player.play(TONE)
+            player.sleep(0.2)
+            player.play(WANDERING)
+            player.record(tmp_path / "wandering.au")
+            start = driver.client.clock.monotonic()
+            while (slid := driver.client.clock.monotonic() - start) < 0.8:
+                player.finger(-0.03 + 0.05 * slid, 0.05, 0.4)
+                player.sleep(0.01)
+            assert player.state().flags == hr.Flag(0)
+            found = player.end_recording()
+            player.play(TONE)
+            player.sleep(0.2)
+            [tone] = player.state().bands
+    assert tone.target == pytest.approx(5e-6, rel=1e-3)
+    last = slice(-1500, None)
+    turns = 60.0 * np.arange(len(found)) / found.rate + found.read("position") / 2e-3
+    waves = np.exp(2j * np.pi * turns[last])
+    size = 2 * np.mean(found.reference[last] * waves.conj())  # it began at some phase, and the clocks are off by some
+    assert abs(size) == pytest.approx(5e-6, rel=0.01)
+    # the host looks at the line once a millisecond: half of it at 0.05 m/s
+    off = found.reference[last] - (size * waves).real
+    assert np.std(off) < 5e-6 / np.sqrt(2) * 2 * np.pi * 0.05 * 0.5e-3 / 2e-3
+    assert sensed_error(found, len(found) - 1500) < error_bound(found)
 
 
 def test_a_board_that_is_found_again_is_recorded_again(program, tmp_path):

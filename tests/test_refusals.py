@@ -384,7 +384,6 @@ DESIGNS = [
     (lambda: StarSTDFT(bandwidth=np.nan, rate=5000.0), "bandwidth=nan Hz must lie between"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
     (lambda: reduced_controller(-1.0, 5.0), "loop_bandwidth=-1.0 Hz: must be > 0 and below"),
-    (lambda: board_design(hr.prepare(SCREEN), 0), "device.kind = 'electroadhesion': a board plays vt-plate only"),
     (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
     (lambda: exported(**BY_CARRIERS), "texture Synthetic: a board plays a whole waveform, without `carriers`"),
     (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),

@@ -39,9 +39,16 @@ void board_init(board_t *board)
 void board_defaults(board_t *board)
 {
     board->gain = REAL(1.0);
-    board->peak = board->rms = design.drive_limit;
+    board->peak = board->rms = law_carrier(&design, design.drive_limit);
     board->heating = REAL(1.0) / design.rate;
     board->displacement = supervision.sensed_bound;
+}
+
+void board_limit_law(board_t *board)
+{
+    if (LAW_FRICTION == 0u) {                     /* the drive of a friction device is an attraction, of its own limit */
+        (void)law_set_drive_limit(&board->law, board->peak);
+    }
 }
 
 void board_begin(board_t *board, board_state state)
@@ -49,11 +56,14 @@ void board_begin(board_t *board, board_state state)
     law_init(&board->law, &board->played);
     supervisor_init(&board->supervisor, &supervision, &board->played);
     board->supervisor.sensed_bound = board->displacement;
-    (void)law_set_drive_limit(&board->law, board->peak);
+    board_limit_law(board);
     (void)law_set_gain(&board->law, board->gain);
     board->state = state;
     board->cause = CAUSE_NONE;
-    board->fade = state == BOARD_PLAYING ? REAL(1.0) : REAL(0.0);   /* the law fades in by itself */
+    board->fade = REAL(0.0);
+    if (state == BOARD_PLAYING && LAW_FRICTION == 0u) {
+        board->fade = REAL(1.0);                  /* the law fades in by itself; a carrier has a bias */
+    }
     board->flags_seen = 0;                        /* of the run before */
     board->fade_to = REAL(1.0);
     board->fade_step = REAL(1000.0) / ((real_t)BOARD_FADE_MS * board->played.rate);
@@ -131,8 +141,14 @@ static void compute_drive(board_t *board)
         real_t reference = textures_step(&board->textures, board->position, board->sample + LAW_LOOKAHEAD,
                                          board->played.rate, &dry);
         board->flags |= dry != 0u ? BOARD_OVERRUN : 0u;
-        board->flags |= supervisor_step(&board->supervisor, &board->law, board->sensed, board->position,
-                                        board->finger.velocity, reference, board->drive);
+        board->flags |= design.learns == 0u ? law_step(&board->law, board->sensed, board->position,
+                                                       board->finger.velocity, reference, board->drive)
+                                            : supervisor_step(&board->supervisor, &board->law, board->sensed,
+                                                              board->position, board->finger.velocity, reference,
+                                                              board->drive);
+        for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
+            board->drive[c] = law_carrier(&design, board->drive[c]);
+        }
         if (board->supervisor.cause != SUPERVISOR_FINE) {
             board_stop(board, CAUSE_SUPERVISOR + (uint32_t)board->supervisor.cause);
         }

@@ -18,7 +18,7 @@
 #include "texture.h"
 
 enum {
-    BOARD_VERSION = 4,
+    BOARD_VERSION = 5,
     BOARD_SILENCE_MS = 80,                        /* without a keep-alive (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
@@ -49,6 +49,8 @@ typedef enum {
     CAUSE_APPLICATION,
     CAUSE_SUPERVISOR = 16                         /* and a supervisor_cause_t */
 } board_cause;
+
+#define BOARD_SENSED (design.learns != 0u ? LAW_SENSORS : 0u) /* sensors: in open loop none */
 
 /* Flags beside those of the law, as hapticrender.protocols.Flag. */
 #define BOARD_OVERRUN 8u
@@ -126,6 +128,7 @@ void board_tick(board_t *board, uint32_t ticks);
 uint32_t board_time(const board_t *board);                      /* us since reset; wraps */
 uint32_t board_samples_of(const board_t *board, uint32_t milliseconds);
 void board_defaults(board_t *board);                            /* gain and limits of the design */
+void board_limit_law(board_t *board);
 void board_begin(board_t *board, board_state state);            /* a run, from rest */
 void board_stop(board_t *board, uint32_t cause);                /* fade out, unless at rest */
 void board_command(board_t *board, frame *from);                /* board_commands.c; `from` with its check value */

@@ -32,8 +32,8 @@ static uint8_t commit(board_t *board, const frame *from)
 {
     band_t bands[LAW_BANDS];
     uint32_t count = from->payload[0], spatial = count > 0u ? 1u : 0u;
-    if (count > LAW_BANDS) {
-        return REASON_VALUE;
+    if (count > LAW_BANDS || (LAW_FRICTION != 0u && count > 0u)) {
+        return REASON_VALUE;                      /* a screen plays waveforms only */
     }
     if (get_u32(from->payload + 1) != crc32(&board->staged[0][0], count * SETPOINT_BYTES, 0u)) {
         return REASON_DIGEST;
@@ -71,15 +71,16 @@ static uint8_t limits(board_t *board, const frame *from)
 {
     real_t peak = (real_t)get_f32(from->payload), rms = (real_t)get_f32(from->payload + 4);
     real_t time = (real_t)get_f32(from->payload + 8), displacement = (real_t)get_f32(from->payload + 12);
-    if (!(peak > REAL(0.0) && peak <= (real_t)(float)design.drive_limit && rms > REAL(0.0) && rms <= peak &&
+    real_t most = law_carrier(&design, design.drive_limit);
+    if (!(peak > REAL(0.0) && peak <= (real_t)(float)most && rms > REAL(0.0) && rms <= peak &&
           time >= REAL(1e-3) && time <= REAL(1e3) && displacement > REAL(0.0))) {
         return REASON_VALUE;
     }
-    board->peak = peak = real_min(peak, design.drive_limit);    /* the host has it as a float */
+    board->peak = peak = real_min(peak, most);    /* the host has it as a float */
     board->rms = rms;
     board->displacement = board->supervisor.sensed_bound = real_min(displacement, supervision.sensed_bound);
     board->heating = real_min(REAL(1.0) / (time * board->played.rate), REAL(1.0));
-    (void)law_set_drive_limit(&board->law, peak);
+    board_limit_law(board);
     return REASON_NONE;
 }
 
@@ -246,14 +247,15 @@ static void hello(board_t *board, const frame *from)
         begin_session(board, nonce);
     }
     uint8_t *at = put_u32(put_u32(put_u8(payload, BOARD_VERSION), board->nonce), board->session);
-    at = put_f32(put_f32(at, (float)design.rate), (float)design.drive_limit);
+    at = put_f32(put_f32(at, (float)design.rate), (float)law_carrier(&design, design.drive_limit));
     at = put_f32(at, (float)design.sensor_limit);
     at = put_u32(at, hardware_cycle_rate);
     at = put_u16(put_u16(at, (uint16_t)design.delay), BOARD_QUEUE);
-    at = put_u8(put_u8(at, LAW_CHANNELS), LAW_SENSORS);
+    at = put_u8(put_u8(at, LAW_CHANNELS), (uint8_t)BOARD_SENSED);
     at = put_u8(put_u8(at, LAW_BANDS), BOARD_LINES);
     at = put_u8(at, BOARD_SILENCE_MS + BOARD_FADE_MS);
     at = put_u8(put_u16(put_u16(at, TEXTURE_RING), TEXTURE_POINTS), LAW_LOOKAHEAD);
+    at = put_u8(at, LAW_FRICTION);
     reply(board, KIND_CAPABILITIES, from->sequence, payload, (size_t)(at - payload));
 }
 

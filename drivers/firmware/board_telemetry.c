@@ -97,7 +97,7 @@ void board_stream(board_t *board)
     for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
         at = put_f32(at, (float)board->acting[c]);
     }
-    for (uint32_t s = 0; s < LAW_SENSORS; s++) {
+    for (uint32_t s = 0; s < BOARD_SENSED; s++) {
         at = put_f32(at, (float)board->sensed[s]);
     }
     at = put_f32(put_f32(at, (float)board->position), (float)board->finger.load);

@@ -60,17 +60,19 @@ uint8_t board_samples(board_t *board, const frame *from)
     if (!(real_abs(scale) <= design.sensor_limit / (real_t)INT16_MAX)) {
         return REASON_VALUE;
     }
-    if (to == NULL || get_u32(from->payload + 1) != to->written) {
-        return REASON_STATE;
+    if (to == NULL || to->written - get_u32(from->payload + 1) > TEXTURE_RING) {
+        return REASON_STATE;                      /* neither the next ones, nor in place of some in the ring */
     }
+    uint32_t next = get_u32(from->payload + 1), back = to->written - next;
     int plays = board->state != BOARD_IDLE && to == &board->textures.of[board->textures.current];
     uint32_t held = plays ? texture_left(to, board->sample + LAW_LOOKAHEAD) : to->written; /* not yet read */
-    if (held + samples > TEXTURE_RING) {
+    if (held + samples > TEXTURE_RING + back) {
         return REASON_STATE;
     }
     for (uint32_t i = 0; i < samples; i++) {
-        to->ring[to->written++ % TEXTURE_RING] = (float)(scale * (real_t)get_i16(from->payload + SAMPLES_HEAD + 2u * i));
+        to->ring[(next + i) % TEXTURE_RING] = (float)(scale * (real_t)get_i16(from->payload + SAMPLES_HEAD + 2u * i));
     }
+    to->written += samples > back ? samples - back : 0u;
     return REASON_NONE;
 }
 

@@ -39,7 +39,15 @@ void finger_track(finger_t *finger, real_t position, real_t rate)
     const uint32_t was_seen = finger->seen;
     const uint32_t leapt =
         ((was_seen != 0u) && (real_abs(position - finger->position) * rate > FASTEST)) ? 1u : 0u;
-    if ((leapt != 0u) || !(real_abs(position) <= FARTHEST)) { /* NaN included */
+    const uint32_t lost = ((leapt != 0u) || !(real_abs(position) <= FARTHEST)) ? 1u : 0u; /* NaN included */
+    if (LAW_FRICTION != 0u) {
+        const uint32_t moves = ((lost == 0u) && (was_seen != 0u)) ? 1u : 0u;
+        const real_t moved = (moves != 0u) ? (real_abs(position - finger->position) * rate) : REAL(0.0);
+        finger->speed = (leapt != 0u) ? REAL(0.0) : (finger->speed + pole * (moved - finger->speed));
+        finger->smooth_speed =
+            (leapt != 0u) ? REAL(0.0) : (finger->smooth_speed + pole * (finger->speed - finger->smooth_speed));
+    }
+    if (lost != 0u) {
         finger->acceleration = REAL(0.0);
         finger->seen = 0u;
         return;

@@ -7,7 +7,7 @@
 #include "machine_m4.h"
 #include "plate.h"
 
-#if LAW_CHANNELS != 2
+#if LAW_CHANNELS != 2 && !LAW_FRICTION
 #error "the plate model has two coils: write the functions of hardware.h for another device"
 #endif
 
@@ -35,14 +35,16 @@ void hardware_sense(real_t sensed[])
 {
     double values[2];
     plate_sense(&plate, values);
-    sensed[0] = (real_t)values[0];
-    sensed[1] = (real_t)values[1];
+    for (uint32_t s = 0u; s < LAW_SENSORS; s++) {
+        sensed[s] = (LAW_FRICTION != 0u) ? REAL(0.0) : (real_t)values[s];
+    }
 }
 
 void hardware_drive(const real_t drive[])
 {
-    plate.next[0] = (double)drive[0];
-    plate.next[1] = (double)drive[1];
+    for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
+        plate.next[c] = (double)drive[c];
+    }
 }
 
 size_t hardware_read(uint8_t bytes[], size_t most)

@@ -9,6 +9,7 @@
 #define LARGEST_MOMENT REAL(1.0)  /* N, of the levelling: a hard press may tilt the device */
 #define MOST_NEEDED REAL(20.0)    /* of the drive's limit; a reference that is scaled by more teaches nothing */
 #define HUGE_NUMBER REAL(1e6)     /* A or N: no drive, no force */
+#define SLOWEST REAL(0.1)         /* of the typical speed: a slower contact hardly modulates at all */
 #define SCALED REAL(0.999)        /* a reference scaled by less is saturated */
 
 void law_init(law_t *law, const design_t *used)
@@ -78,7 +79,8 @@ static void glide_gain(law_t *law)
 static real_t faded_waveform(law_t *law, real_t waveform)
 {
     const design_t *d = law->design;
-    const uint32_t plays = ((law->learning.contact != 0u) || (d->spatial == 0u)) ? 1u : 0u;
+    const uint32_t always = ((d->spatial == 0u) && (LAW_FRICTION == 0u)) ? 1u : 0u;
+    const uint32_t plays = ((law->learning.contact != 0u) || (always != 0u)) ? 1u : 0u;
     if (real_abs(waveform) <= d->sensor_limit) { /* else it is held */
         law->last_waveform = waveform;
     }
@@ -113,6 +115,13 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
     for (uint32_t i = 0u; i < LAW_FILTER_TAPS; i++) {
         for (uint32_t order = 0u; order < 4u; order++) {
             r[order] += d->filters[order][i] * law->window[i];
+        }
+    }
+    if (LAW_FRICTION != 0u) { /* what has to be made is r + lag r', for the contact to follow r */
+        const finger_t *finger = &law->finger;
+        const real_t speed = real_max(REAL(2.0) * finger->speed - finger->smooth_speed, SLOWEST * d->typical_speed);
+        for (uint32_t order = 0u; order < 3u; order++) {
+            r[order] += d->contact_length / speed * r[order + 1u];
         }
     }
     real_t poles[2];
@@ -370,6 +379,11 @@ uint32_t law_step(
     learning_advance(law, law->ring[law->at_ring]); /* what was computed LAW_DELAY samples ago acts now */
     law->sample++;
     return law->flags;
+}
+
+real_t law_carrier(const design_t *used, real_t drive)
+{
+    return (LAW_FRICTION != 0u) ? real_sqrt(real_max(used->bias + drive, used->least) / used->attraction) : drive;
 }
 
 real_t law_reference(const law_t *law) { return law->reference / law->smooth_scale; }

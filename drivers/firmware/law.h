@@ -1,5 +1,7 @@
 /*
- * The control law of hapticrender (method "inverse") for one plate: sample by sample, bands and a waveform.
+ * The control law of hapticrender (method "inverse") for one plate: sample by sample, bands and a waveform.  For an
+ * electroadhesive screen (LAW_FRICTION 1) it plays a waveform in open loop: the drive is an attraction in N, targets are
+ * impulses in N s, whose derivative is the friction, and `law_carrier` turns the drive into the carrier's peak.
  *
  * It equals hapticrender/control/inverse_kernel.py with a block of one sample; docs/theory.md has the equations.
  * There is no heap, no recursion and no global variable but the constant `design`.  All state lies in `law_t`, whose
@@ -68,6 +70,10 @@ typedef struct {
     real_t drive_from_force[LAW_CHANNELS][2]; /* A/N */
     real_t pattern[2];      /* pattern of the target over the coordinates */
     real_t lever_per_metre; /* 1/m: lever arm of a finger at x is this times x */
+    /* friction, where LAW_FRICTION is 1: an attraction makes it, which goes with the square of a carrier's peak */
+    real_t contact_length;              /* m, by which the friction lags behind the attraction */
+    real_t typical_speed, least_speed;  /* m/s; a slower finger sticks */
+    real_t bias, least, attraction;     /* N, N, N per square of the peak: sqrt(max(bias + drive, least) / attraction) */
     /* inner damper */
     real_t taps[2][LAW_DAMPER_TAPS]; /* N/m */
     real_t damper_high;              /* gain while it is open, 1 or 0 */
@@ -103,6 +109,7 @@ typedef struct {
 
 typedef struct {
     real_t position, smooth_position, velocity, acceleration; /* m, m, m/s, m/s^2 */
+    real_t speed, smooth_speed;                               /* m/s: magnitudes, where LAW_FRICTION is 1 */
     uint32_t seen;                                            /* 1: it touches */
 } finger_t;
 
@@ -172,6 +179,11 @@ uint32_t law_step(
 /* Target and measured envelope (re, im; m) of a band < most_bands as of the last sample, at its carrier. */
 void law_target(const law_t *law, uint32_t band, real_t envelope[2]);
 void law_measured(const law_t *law, uint32_t band, real_t envelope[2]);
+
+/*
+ * Peak of the carrier (A or V, as exported) for a drive (N) of a friction device; the drive itself on a plate.
+ */
+real_t law_carrier(const design_t *used, real_t drive);
 
 /* Reference (m) of the last sample's sensing, before it is scaled down to the drive's limit. */
 real_t law_reference(const law_t *law);

@@ -258,8 +258,9 @@ uint32_t learning_follow_contact(law_t *law)
 {
     learning_t *v = &law->learning;
     const design_t *d = law->design;
-    uint32_t touching = law->finger.seen;
-    if (touching != 0u) {
+    const uint32_t sticks = ((LAW_FRICTION != 0u) && (law->finger.speed < d->least_speed)) ? 1u : 0u;
+    uint32_t touching = (sticks != 0u) ? 0u : law->finger.seen;
+    if (law->finger.seen != 0u) {
         v->lever = real_clip(d->lever_per_metre * law->finger.position, -FARTHEST_LEVER, FARTHEST_LEVER);
     }
     v->since += (v->since < UINT32_MAX) ? 1u : 0u;

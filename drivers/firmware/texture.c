@@ -18,7 +18,7 @@ void textures_init(textures_t *textures)
     textures->current = 0u;
     textures->weight = REAL(1.0);
     textures->touch = REAL(0.0);
-    textures->finger = (finger_t){REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0), 0u};
+    textures->finger = (finger_t){REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0), REAL(0.0), 0u};
 }
 
 texture_t *textures_next(textures_t *textures) { return &textures->of[1u - textures->current]; }

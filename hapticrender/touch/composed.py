@@ -3,6 +3,7 @@
 import math
 import os
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -113,6 +114,15 @@ class SeparatedTexture:
             if along == spatial:
                 total += gain * bands.checked(type(texture).__name__, waveform, time, position)
         return total
+
+
+def evaluated(name: str, bands: Bands, waveform: Any) -> Any:
+    """Return the waveform of time (s) and position (m), checked; a ValueError where two readings of it differ."""
+    checked = partial(bands.checked, name, waveform)
+    tried = np.repeat(SOON, len(PLACES)), np.tile(PLACES, len(SOON))
+    if (checked(*tried) != checked(*tried)).any():
+        raise ValueError(f"{name}: must not change with a reading")
+    return checked
 
 
 def _read_parts(key: str, value: Any, **bounds: Any) -> Parts:
