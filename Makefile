@@ -17,7 +17,7 @@ REAL_TIME := tests/test_audio_jack.py tests/test_audio_verbs.py $(wildcard tests
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
 	nu32.py player_board.py)
-API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime_entry skin validate protocols bands errors touch recordings analysis \
+API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime_entry validate protocols bands errors touch recordings analysis \
 	control plants renderers drivers)
 
 help: ## list the verbs

@@ -62,42 +62,7 @@ A wrong argument (a shape, a NaN) is a ``ValueError`` before anything is played;
 gone is a `DriverError` that names device and operation; samples lost or cut are `Flag` bits in ``Sensed.flags``, which
 has no others.  Motion that has been stated is stated in every later block.
 
-Nothing has to be inherited.  Here is a whole driver, a plate on two coils with a sensor at each end of its glass:
-
->>> import numpy as np
->>> from scipy.linalg import expm
->>> import hapticrender as hr
->>> class MyPlate:
-...     rate, block, delay = 5000.0, 1, 1
-...     drive_channels, sensed_channels = 2, 2
-...
-...     def __init__(self):
-...         mass = np.array([[0.032], [4e-5 / 0.0275**2]])  # kg: heave and rocking, seen at the coils
-...         stiffness = np.array([[45.3e3, 0.5e3], [0.5e3, 45.3e3]])  # N/m
-...         damping = np.array([[1.7, 0.0], [0.0, 1.7]])  # N s/m
-...         coils = 7.4 * np.array([[1.0, 1.0], [-1.0, 1.0]])  # N/A
-...         generator = np.zeros((6, 6))
-...         generator[:2, 2:4] = np.eye(2)
-...         generator[2:4] = np.hstack([-stiffness, -damping, coils]) / mass
-...         self.advance = expm(generator / self.rate)  # exact while the drive is held
-...         self.state = np.zeros(6)  # heave, rocking, their rates, the two currents
-...
-...     def __enter__(self):
-...         return self
-...
-...     def __exit__(self, *exc):
-...         self.play(np.zeros((1, 2)))
-...
-...     def play(self, drive):
-...         heave, rocking = self.state[:2]
-...         sensed = [heave - 2 * rocking, heave + 2 * rocking]  # glass ends lie twice as far out as the coils
-...         self.state[4:] = drive[0]
-...         self.state = self.advance @ self.state
-...         return hr.Sensed(np.array([sensed]))
->>> scene = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=3.0)
->>> recording = hr.render(scene, driver=MyPlate())
->>> print(f"{1e6 * recording.summary()['bands'][0]['achieved']:.1f} um")
-10.0 um
+Nothing has to be inherited: ``examples/your_own_driver.py`` is a whole plate in thirty lines.
 """
 
 from collections.abc import Callable

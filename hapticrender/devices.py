@@ -33,9 +33,9 @@ FORMS = "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or package.module:
 
 def registered(group: str, name: str) -> Any:
     """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
-    found = {point.name: point for point in entry_points(group=f"hapticrender.{group}")}
+    found = _points(group)
     if name not in found:
-        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(sorted(found)) or 'none'}")
+        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(found) or 'none'}")
     try:
         return found[name].load()
     except Exception as error:
@@ -61,13 +61,13 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
 
     >>> open_driver("simulated") is None
     True
-    >>> open_driver("wavefile:drive.flac").rate
+    >>> open_driver("wavefile:drive.wav").rate
     48000.0
     """
     if text == SIMULATED:
         return None
     name, colon, argument = text.partition(":")
-    if any(point.name == name for point in entry_points(group="hapticrender.drivers")):
+    if name in _points("drivers"):
         factory = registered("drivers", name)
     else:
         called, colon, argument = argument.partition(":")
@@ -140,7 +140,7 @@ def imported(text: str, module: str, called: str) -> Any:
     try:
         factory = getattr(import_module(module), called)
     except (ImportError, AttributeError, ValueError) as error:
-        names = ", ".join(point.name for point in _points("drivers"))
+        names = ", ".join(_points("drivers"))
         raise ValueError(f"driver = {text!r}: {error}{_cure(error)}; installed are {names}; or {FORMS}") from error
     except Exception as error:  # a user's own module may fail in any way
         raise HapticError(f"driver = {text!r}: {module} cannot be loaded: {type(error).__name__}: {error}") from error
@@ -193,13 +193,14 @@ def text() -> str:
     return "\n\n".join([table(kinds), table(drivers), hint, table(there), table(extras)])
 
 
-def _points(group: str) -> list[Any]:
-    return sorted(entry_points(group=f"hapticrender.{group}"), key=lambda entry: entry.name)
+def _points(group: str) -> dict[str, Any]:
+    """Entry points of a group by their names, in order."""
+    return {entry.name: entry for entry in sorted(entry_points(group=f"hapticrender.{group}"), key=lambda e: e.name)}
 
 
 def _loaded(group: str) -> Iterator[tuple[Any, Any, str]]:
     """Entry points and what they are, or None and why it cannot be used."""
-    for entry in _points(group):
+    for entry in _points(group).values():
         try:
             found, trouble = entry.load(), ""
         except (Exception, SystemExit) as error:  # a third party's module may fail in any way; the list must go on

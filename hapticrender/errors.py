@@ -75,7 +75,7 @@ class WatchdogTimeout(HapticError):
 
 
 class PlateMismatch(UserWarning):
-    """The device differs from the model that a controller is designed for; names the quantities and by how much.
+    """The device differs from the model that a controller is designed for; states by how much, and what to do.
 
     Raised as an error, where warnings are, it holds the `recording` of the run, if there was one.
     """

@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -19,16 +18,13 @@ from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
 from hapticrender.loop import (
-    CHUNK,
     RECENT,
-    departure,
     device_fault,
     differences,
-    motion_of_sensors,
-    samples_late,
+    motion_of,
+    motion_source,
     stops_itself,
 )
-from hapticrender.mathx import on_time
 from hapticrender.protocols import Array, Controller, Flag, Rendering
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
@@ -235,19 +231,15 @@ class LiveLoop(RealtimeEntry):
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
         if self.model.finger.needs_contact:  # as `Rendering.requested`
             found["reference"] = np.where(np.isnan(found["position"]), 0.0, found["reference"])
-        sensed, late = found["sensed"], samples_late(self.driver, self.model, self._has_motion)
-        count = max(len(sensed) - math.ceil(late), 0)
-        found = {name: signal[:count] for name, signal in found.items()}
-        true = self._true[(first + np.arange(len(sensed))) % len(self._true)]
-        found["normal_load"] = np.where(np.isnan(true[:count, -1]), found["normal_load"], true[:count, -1])
-        motion = on_time(true[:, :-1], count, late)  # NaN where nothing is sensed
-        if not self._has_motion and sensed.shape[1]:
-            follows = first == self._followed
-            contact = self._contact if follows else ContactLag(self.model.contact_lag)
-            motion = motion_of_sensors(self.model, sensed, found["position"], contact)
-            if first >= self._followed:
-                self._contact, self._followed = contact, first + count
-        return first, found | {"motion": motion, "target": np.zeros((count, 0), complex)}
+        true = self._true[(first + np.arange(len(found["flags"]))) % len(self._true)]
+        found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
+        stated = {"motion": true[:, :-1]} if self._has_motion else {}
+        contact = self._contact if first == self._followed else ContactLag(self.model.contact_lag)
+        motion = motion_of(self.driver, self.model, found | stated, contact)
+        if first >= self._followed:
+            self._contact, self._followed = contact, first + len(motion)
+        found = {name: signal[: len(motion)] for name, signal in found.items()}
+        return first, found | {"motion": motion, "target": np.zeros((len(motion), 0), complex)}
 
     def watch_touches(self, signals: dict[str, Array], gap: int) -> None:
         """Flag two touches in the signals that follow those of the last call, `gap` samples later."""
@@ -259,26 +251,16 @@ class LiveLoop(RealtimeEntry):
     @property
     def motion_source(self) -> str:
         """Where `motion` comes from."""
-        if self._has_motion:
-            return str(getattr(self.driver, "motion_source", "true"))
-        if not self.driver.sensed_channels:
-            return "unknown"
-        return "inferred" if self.model.inferred else "sensors"
+        return motion_source(self.driver, self.model, self._has_motion)
 
     def figures(self) -> list[Row]:
         """What every band did over the last `JUDGED` seconds, see `band_figures`."""
         first, signals = self.signals(self.samples - round(JUDGED * self.driver.rate))
         return band_figures(self.rendering.bands, first, self.driver.rate, signals)
 
-    def compare(self) -> Callable[[], tuple[str, ...]]:
-        """Note how the device departs from the model of the controller that runs; `differences` when that is called."""
-        end, found = self.samples, (1.0, 0.0) if self.stopped is not None else departure(self.running)
-
-        def state() -> tuple[str, ...]:
-            first, signals = self.signals(end - round(CHUNK * self.driver.rate))
-            return differences(self.rendering, *found, {name: each[: end - first] for name, each in signals.items()})
-
-        return state
+    def compare(self) -> tuple[str, ...]:
+        """State where the device differs from the model of the controller that runs, unless that was stopped."""
+        return () if self.stopped is not None else differences(self.rendering, self.running)
 
     def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""

@@ -159,9 +159,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
             raise fault
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
-    start = max(len(recording) - round(CHUNK * recording.rate), 0)
-    last = {name: recording.read(name, start) for name in ("position", "drive", "sensed")}
-    recording.warnings = differences(rendering, *departure(loop.controller), last)
+    recording.warnings = differences(rendering, loop.controller)
     warn_of(recording.warnings, recording)
     return recording
 
@@ -215,15 +213,28 @@ def samples_late(driver: Driver, model: DeviceModel, stated: bool) -> float:
     return max(delay, 0.0) * model.rate
 
 
-def motion_of_sensors(model: DeviceModel, sensed: Array, position: Array, contact: ContactLag) -> Array:
-    """Motion at the evaluation points at the n samples of `position`, shape (n, places), by the sensors.
+def motion_of(driver: Driver, model: DeviceModel, signals: dict[str, Array], contact: ContactLag) -> Array:
+    """Motion at the evaluation points (n, places) at the first n samples of `signals`, for which it is known by now.
 
-    They show it `sensor_delay` later, so that `sensed` goes on for so long; friction is inferred behind `contact`.
+    It is the ``motion`` that the driver states, that of the sensors, or NaN; friction is inferred behind `contact`.
     """
+    stated = signals.get("motion")
+    late = samples_late(driver, model, stated is not None)
+    count = max(len(signals["flags"]) - math.ceil(late), 0)
+    if stated is not None:
+        return on_time(stated, count, late)
+    if not driver.sensed_channels:
+        return np.full((count, len(model.places)), np.nan)
     with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-        shown = sensed @ model.place_from_sensed.T
-        motion = on_time(shown, len(position), max(model.sensor_delay, 0.0) * model.rate)
-        return contact.run(motion, position) if model.inferred else motion
+        motion = on_time(signals["sensed"] @ model.place_from_sensed.T, count, late)
+        return contact.run(motion, signals["position"][:count]) if model.inferred else motion
+
+
+def motion_source(driver: Driver, model: DeviceModel, stated: bool) -> str:
+    """Where `motion_of` comes from."""
+    if stated:
+        return str(getattr(driver, "motion_source", "true"))
+    return "unknown" if not driver.sensed_channels else "inferred" if model.inferred else "sensors"
 
 
 def play_zeros(driver: Driver) -> None:
@@ -289,7 +300,7 @@ class _Loop:
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_lag)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
-        self._late, self._has_motion = 0.0, False  # samples after which it is; whether the device states it
+        self._has_motion = False  # whether the device states it
         self._recent = np.zeros(0, int)  # flags
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
@@ -309,22 +320,18 @@ class _Loop:
         signals = {"drive": drive, "sensed": values, "position": position, "normal_load": load}
         signals |= {"target": target, "flags": flags}
         signals["flags"] = self._touches.update(signals)
-        return self._due(
-            {name: signal[:count] for name, signal in signals.items()},
-            None if sensed.motion is None else sensed.motion[:count],
-        )
+        signals |= {} if sensed.motion is None else {"motion": sensed.motion}
+        return self._due({name: signal[:count] for name, signal in signals.items()})
 
     def rest(self) -> dict[str, Any]:
-        """Signals of the samples that are held back for their motion, at the end."""
-        held, late = self._held, math.ceil(self._late)
+        """Signals of the samples that are held back for their motion, at the end: as if they went on as they came."""
+        held, rendering = self._held, self.rendering
+        late = math.ceil(samples_late(rendering.driver, rendering.model, "motion" in held))
         if not len(held["flags"]):
             return held
-        on = {  # goes on as it came
-            name: np.pad(held[name], ((0, late), (0, 0)), "reflect", reflect_type="odd")
-            for name in ("sensed", "motion")
-            if name in held
-        }
-        return held | self._moved(held | on, len(held["flags"]))
+        ends = {name: [(0, late), (0, 0)][: signal.ndim] for name, signal in held.items()}
+        on = {name: np.pad(each, ends[name], "reflect", reflect_type="odd") for name, each in held.items()}
+        return held | self._moved(on)
 
     def fault(self, start: int) -> DeviceFault | None:
         """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
@@ -363,47 +370,39 @@ class _Loop:
     def _time(self, count: int) -> Array:
         return (self._start + np.arange(count)) / self.rendering.driver.rate
 
-    def _due(self, signals: dict[str, Array], motion: Array | None) -> dict[str, Any]:
-        """Signals of all samples whose motion is known, with it and its source: device, sensors, or none (NaN)."""
+    def _due(self, signals: dict[str, Array]) -> dict[str, Any]:
+        """Signals of all samples whose motion is known, with it and its source."""
         held = self._held
-        if motion is not None:  # the first of it holds for what was held back before
-            signals["motion"] = motion
-            held.setdefault("motion", np.repeat(motion[:1], len(held["flags"]), axis=0))
         if len(held["flags"]):
+            if "motion" in signals:  # the first of it holds for what was held back before
+                held.setdefault("motion", np.repeat(signals["motion"][:1], len(held["flags"]), axis=0))
             signals = {name: np.concatenate([held[name], signal]) for name, signal in signals.items()}
-        self._late = samples_late(self.rendering.driver, self.rendering.model, motion is not None)
-        count = max(len(signals["flags"]) - math.ceil(self._late), 0)
-        found = self._moved(signals, count)
+        found = self._moved(signals)
+        count = len(found["motion"])
         self._held = {name: signal[count:] for name, signal in signals.items()}
         return {name: signal[:count] for name, signal in signals.items()} | found
 
-    def _moved(self, signals: dict[str, Array], count: int) -> dict[str, Any]:
-        """Motion of the first `count` samples, and its source."""
-        model = self.rendering.model
-        if "motion" in signals:
-            source = getattr(self.rendering.driver, "motion_source", "true")
-            return {"motion": on_time(signals["motion"], count, self._late), "motion_source": source}
-        if not signals["sensed"].shape[1]:
-            return {"motion": np.full((count, len(model.places)), np.nan), "motion_source": "unknown"}
-        motion = motion_of_sensors(model, signals["sensed"], signals["position"][:count], self._contact)
-        return {"motion": motion, "motion_source": "inferred" if model.inferred else "sensors"}
+    def _moved(self, signals: dict[str, Array]) -> dict[str, Any]:
+        """Motion of the samples for which it is known, and its source."""
+        driver, model = self.rendering.driver, self.rendering.model
+        motion = motion_of(driver, model, signals, self._contact)
+        return {"motion": motion, "motion_source": motion_source(driver, model, "motion" in signals)}
 
 
-def departure(controller: Controller) -> tuple[float, float]:
-    """Gain to which an inner damper was turned down, and share that a controller adds to what its model asks for."""
-    return getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
-
-
-def differences(rendering: Rendering, scale: float, mismatch: float, last: dict[str, Array]) -> tuple[str, ...]:
-    """State by its `departure` where the device differs from a model; `last`: signals of the last `CHUNK` seconds."""
+def differences(rendering: Rendering, controller: Controller) -> tuple[str, ...]:
+    """State where a device differs from its model, by what a controller has learned on it."""
+    scale, mismatch = getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
     source, messages = rendering.scene.source, []
     if scale < 1.0:
-        message = f"the inner damper rang above 500 Hz and was turned down to {scale:g}: identify the bending mode, or "
-        message += "the sensors' noise where there is none"
-        message += f", which profile {source} lacks" if source else ""
-        messages.append(message)
+        lacks = f", which profile {source} lacks" if source else ""
+        cure = f"identify the bending mode, or the sensors' noise where there is none{lacks}"
+        messages.append(f"the inner damper rang above 500 Hz and was turned down to {scale:g}: {cure}")
     if mismatch > MISMATCH:
-        messages.append(_mismatch(rendering, last, mismatch))
+        adds = f"the controller adds {100 * mismatch:.1f} % to what that asks for (bound {100 * MISMATCH:g} %)"
+        cure = "correct [device]"
+        if rendering.scene.device == "vt-plate":
+            cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
+        messages.append(f"the device differs from its model{f', profile {source}' if source else ''}: {adds}; {cure}")
     return tuple(messages)
 
 
@@ -415,39 +414,3 @@ def warn_of(messages: tuple[str, ...], recording: Recording | None = None) -> No
         except PlateMismatch as error:
             error.recording = recording
             raise
-
-
-def _mismatch(rendering: Rendering, last: dict[str, Array], mismatch: float) -> str:
-    """State by how much the device differs from its model, at which frequencies, and what to do."""
-    errors, source = _stiffness_errors(rendering, last), rendering.scene.source
-    found = ", ".join(f"{100 * error:+.1f} % at {hertz:g} Hz" for hertz, error in errors)
-    cure = "correct [device]"
-    if rendering.scene.device == "vt-plate":
-        cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
-    return (
-        f"the device differs from its model{f', profile {source}' if source else ''}: the controller adds "
-        f"{100 * mismatch:.1f} % to what that asks for (bound {100 * MISMATCH:g} %)"
-        f"{f'; dynamic stiffness against the model: {found}' if found else ''}; {cure}"
-    )
-
-
-def _stiffness_errors(rendering: Rendering, last: dict[str, Array]) -> list[tuple[float, float]]:
-    """Relative error of the model's dynamic stiffness |D_11| at every fixed carrier (Hz), without a finger.
-
-    Least squares of all carriers over the `last` signals; D_11 = (F_1 - sum_j D_1j q_j)/q_1.
-    """
-    model, bands = rendering.model, rendering.bands
-    hertz = np.unique(bands.frequency[(bands.wavenumber == 0.0) & (bands.frequency > 0.0)])
-    position, drive, sensed = (last[name] for name in ("position", "drive", "sensed"))
-    if not hertz.size or np.isfinite(position).any() or len(drive) < 8 * len(hertz):
-        return []
-    phase = 2 * np.pi / model.rate * np.multiply.outer(np.arange(len(drive)), hertz)
-    waves = np.hstack([np.cos(phase), -np.sin(phase)])
-    found = np.linalg.lstsq(waves, np.hstack([drive, sensed]), rcond=None)[0]
-    drive, sensed = np.hsplit(found[: len(hertz)] + 1j * found[len(hertz) :], [drive.shape[1]])
-    drive *= (model.hold_and_delay(hertz) * np.exp(2j * np.pi * hertz / model.rate))[:, None]  # row n: from n - 1
-    q, stiffness = sensed @ model.coordinate_from_sensed.T, model.dynamic_stiffness(hertz)
-    force = drive @ model.force_from_drive[0] - (stiffness[:, 0, 1:] * q[:, 1:]).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off = abs(force / q[:, 0] / stiffness[:, 0, 0]) - 1.0
-    return [(float(at), float(value)) for at, value in zip(hertz, off, strict=True) if np.isfinite(value)]

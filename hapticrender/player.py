@@ -16,6 +16,7 @@ import atexit
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
@@ -32,7 +33,6 @@ from hapticrender.devices import open_driver
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
-from hapticrender.live_playlist import LivePlaylist, parts_of
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
 from hapticrender.loop import opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_state import BandState, PlayerState
@@ -40,6 +40,7 @@ from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
 from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
+from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import MOST_LOAD, Finger
 from hapticrender.touch.scene import Scene
 
@@ -48,6 +49,7 @@ LONGEST_WATCHDOG = 60.0  # s
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
 LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end, as it is designed, as a recording says
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
+LEAST_PART = 0.1  # s, of a playlist along the surface: twice the time between two looks at what is due
 UPDATES = 0.2  # s: two positions within this time show a velocity
 END_FADE = 0.05  # s: five time constants of the gain; and the longest that zeros are waited for
 POINTING, INSTANT = 0.01, 1e-4  # s between two positions of a scene's finger; over which its velocity is found
@@ -113,18 +115,19 @@ class Player(Addressed):
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
-        self._motion, self._playlist = LiveMotion(), LivePlaylist()
+        self._motion = LiveMotion()
+        self._parts: deque[tuple[Rendering, float]] = deque()  # of a playlist, and how long (s); the first plays ...
+        self._until = math.inf  # s: ... until then
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
-        self._loop: LiveLoop | None = None
+        self._loop: Any = None  # a `LiveLoop`, or that of a board, once something plays
         self._gain, self._lost, self._raised = 1.0, 0, False
         self._error: BaseException | None = None
         self._recorder: Recorder | None = None
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls, self._watched = 0, math.inf  # of the application under way; s: the watchdog's time at the moment
         self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
-        self._recorded, self._seen = 0, 0  # samples of this loop that were looked at; and played at the last look
-        self._served, self._idle = 0.0, 0.0  # s: when that was; of looks since there was a new sample
+        self._recorded = 0  # samples of this loop that were looked at
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
         self._stopping, self._timeout = self._threads.stopping, TIMEOUT  # s; and two blocks of the driver
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
@@ -141,7 +144,7 @@ class Player(Addressed):
         """Zero drive, then close the device and the recording; a fault not seen yet is raised, later ones noted."""
         if not self._entered:  # a generator's `with`, after the program's end
             return
-        first, compared = error or (None if self._raised else self._error), tuple
+        first, compared = error or (None if self._raised else self._error), tuple[str, ...]()
         with stopped_by_signal(wait=True), noted_on(first), ExitStack() as last:  # last to first, whatever fails
             last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
@@ -151,7 +154,7 @@ class Player(Addressed):
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
             if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; while it plays
-                compared = getattr(self._loop, "compare", lambda: tuple)()
+                compared = getattr(self._loop, "compare", tuple)()
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
@@ -160,7 +163,7 @@ class Player(Addressed):
             if error is None:
                 raise self._unwritten
             error.add_note(f"and the recording is not whole: {self._unwritten}")
-        warn_of(compared())
+        warn_of(compared)
 
     @property
     def time(self) -> float:
@@ -193,32 +196,34 @@ class Player(Addressed):
         DeviceFault, DriverError
             The device has failed.
         """
-        parts = parts_of(texture)
+        parts = texture.parts if isinstance(texture, Playlist) and texture.spatial else ((texture, math.inf),)
+        if (shortest := min(seconds for _, seconds in parts)) < LEAST_PART:
+            raise ValueError(f"a part of {shortest:g} s of a playlist along the surface: must be >= {LEAST_PART:g} s")
         with self._changing, self._busy():  # the device goes on: a long recording takes seconds to prepare
-            scenes = [self._scene(texture=each) for each, _ in parts]
-            loop = self._loop
-            if loop is None:
-                with self._lock:
-                    self._check()
-                    self._playlist.begin(self._begin(scenes), parts, self.time)
-                return
-            renderings = [self._prepare(each) for each in scenes]
-            made, *_ = [loop.made(each) for each in renderings]
+            scenes, loop = [self._scene(texture=each) for each, _ in parts], self._loop
+            renderings = [] if loop is None else [self._prepare(each) for each in scenes]
+            made = [] if loop is None else [loop.made(each) for each in renderings]
             with self._lock:
                 self._check()
-                loop.replace(renderings[0], *made)
-                self._playlist.begin(renderings, parts, self.time)
+                if loop is None:
+                    renderings = self._begin(scenes)
+                else:
+                    loop.replace(renderings[0], *made[0])
+                self._parts = deque(zip(renderings, (seconds for _, seconds in parts), strict=True))
+                self._until = self.time + parts[0][1]
 
     def _prepare(self, scene: Scene) -> Rendering:
         """Return the rendering of a scene on the device that plays."""
-        playing = self._playing("play").rendering
+        playing = self._loop.rendering
         return prepare(scene, driver=None if playing.plant is not None else playing.device, compiled=False)
 
     def _go_on(self) -> None:
         """Fade into the next part of a playlist where it is due."""
-        if rendering := self._playlist.due(self.time):
-            loop = self._playing("play")
-            loop.replace(rendering, *loop.made(rendering))
+        if self.time >= self._until:
+            self._parts.rotate(-1)
+            rendering, seconds = self._parts[0]
+            self._until += seconds
+            self._loop.replace(rendering, *self._loop.made(rendering))
 
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
@@ -268,7 +273,7 @@ class Player(Addressed):
             if unwritten is not None:
                 raise unwritten
             recording = recorder.finish()
-            recording.warnings = getattr(self._loop, "compare", lambda: tuple)()()
+            recording.warnings = getattr(self._loop, "compare", tuple)()
             return recording
 
     def state(self) -> PlayerState:
@@ -298,7 +303,7 @@ class Player(Addressed):
             with self._lock:
                 self._check()
 
-    def _playing(self, what: str) -> LiveLoop:
+    def _playing(self, what: str) -> Any:
         if self._loop is None:
             raise ValueError(f"{what}: nothing plays yet: call play first")
         return self._loop
@@ -375,56 +380,58 @@ class Player(Addressed):
         loop.set_gain(self._gain)
         if self._finger is not None:
             loop.finger(*self._finger)
-        renderings = [rendering, *map(self._prepare, others)]
-        for each in renderings[1:]:
+        later = [self._prepare(each) for each in others]
+        for each in later:
             loop.made(each)
         if calls_back:
             device.start(loop)
             stack.callback(device.stop)
+            self._run(lambda: foresee(loop, self._stopping), device, lambda: loop.evaluating)
         elif own:
             loop.start()
         elif self._paced:
             self._run(lambda: hold_to_clock(loop, self._block, self._stopping), device)
-        if calls_back:
-            self._run(lambda: foresee(loop, self._stopping), device, lambda: loop.evaluating)
         if self._paced:
             self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
-        return renderings
+        return [rendering, *later]
 
     def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] = str) -> None:
         """Run `target` in a thread until the player stops; what it raises is kept for the application."""
 
         def failed(error: BaseException) -> None:
             self._error = self._error or error
-            loop = self._playing("play")
             with suppress(Exception):  # zero drive at once, on a device that may have failed
-                loop.silence()
+                self._loop.silence()
             with suppress(Exception):
                 if not self._clocked:
+<<<<<<< HEAD
                     play_zeros(loop.rendering.device)
+=======
+                    play_zeros(self._loop.driver)
+>>>>>>> cuta
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""
-        self._playing("play").advance(self._given is not None or self._finger is None, late)
+        self._loop.advance(self._given is not None or self._finger is None, late)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
-        driver = self._playing("sleep").driver
-        for _ in range(max(round(seconds * driver.rate / driver.block), 1)):
+        loop = self._loop
+        for _ in range(max(round(seconds * loop.driver.rate / loop.driver.block), 1)):
             self._block()
         with self._lock:
             self._watch()
             self._go_on()
-            self._playing("sleep").fill()
+            loop.fill()
             self._service()
 
     def _serve(self) -> None:
+        loop, served, seen, idle = self._loop, 0.0, 0, 0.0  # s: last look; samples by then; s without a new one
+        period = SERVICE if isinstance(loop, LiveLoop) else POINTING
         while not self._stopping.wait(POINTING):
-            loop = self._playing("play")
-            period = SERVICE if isinstance(loop, LiveLoop) else POINTING
-            due = time.monotonic() - self._served >= period
+            due = time.monotonic() - served >= period
             if due and isinstance(loop, LiveLoop):
                 loop.fill_some()  # which may take long: others go on meanwhile
             with self._lock:
@@ -434,23 +441,22 @@ class Player(Addressed):
                 self._point()
                 self._go_on()
                 if due:
-                    self._served = time.monotonic()
+                    served = time.monotonic()
                     self._service()
-                    self._seen, self._idle = loop.samples, self._idle + period if loop.samples == self._seen else 0.0
-                if self._idle > self._timeout:  # by looks: time during which this process stood still does not count
-                    raise DeviceTimeout(f"the device has played no sample for {self._idle:.2g} s: check it and driver")
+                    seen, idle = loop.samples, idle + period if loop.samples == seen else 0.0
+                if idle > self._timeout:  # by looks: time during which this process stood still does not count
+                    raise DeviceTimeout(f"the device has played no sample for {idle:.2g} s: check it and driver")
 
     def _point(self) -> None:
         """Send the position of the scene's finger to a device that does not sense it."""
-        loop = self._playing("play")
-        if self._given is not None and self._finger is None and not loop.senses:
+        if self._given is not None and self._finger is None and not self._loop.senses:
             finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
             (here, there), load = finger.position(now), finger.load(now)[0]
-            loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
+            self._loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
 
     def _service(self) -> None:
         """Record what was, see whether the device or the application has stopped."""
-        loop = self._playing("play")
+        loop = self._loop
         if not isinstance(loop, LiveLoop):
             loop.fill()  # says whether a board is there
         if hasattr(loop.rendering.device, "check"):
@@ -467,10 +473,9 @@ class Player(Addressed):
             except OSError as error:
                 self._unwritten = error
                 self._close_recorder(stopped=False)
-        if self._error is None and fault:
-            self._error = fault
-            if isinstance(fault, WatchdogTimeout):
-                self._error = WatchdogTimeout(fault.time, self._watchdog or self._timeout)
+        if isinstance(fault, WatchdogTimeout):
+            fault = WatchdogTimeout(fault.time, self._watchdog or self._timeout)
+        self._error = self._error or fault
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""
@@ -493,8 +498,8 @@ class Player(Addressed):
                 self._service()
 
     def _close_recorder(self, stopped: bool) -> None:
-        if self._recorder is not None:
-            try:
+        try:
+            if self._recorder is not None:
                 self._recorder.close(stopped)
-            except OSError as error:
-                self._unwritten = self._unwritten or error
+        except OSError as error:
+            self._unwritten = self._unwritten or error

@@ -229,9 +229,8 @@ class RealtimeEntry(Addressed):
                 raise ValueError("controller: its state is laid out otherwise: must have the delay of the one before")
             self._control = control
         texture.control, texture.record["control"] = self._control, self._control.address
-        self._slot["texture"] = texture.address
         self._textures = [each for each in self._textures if each.address in used] + [texture]
-        self._hand_over()
+        self._set(texture=texture.address)
 
     def fill(self) -> None:
         """Compute what comes next of all textures in time; call it at least once a second."""
@@ -244,30 +243,20 @@ class RealtimeEntry(Addressed):
         """Set the finger's position (m, NaN: lifted), velocity (m/s) and load (N) at the start of the next block."""
         if np.isinf(position) or not np.isfinite(velocity) or not 0.0 <= load < np.inf:
             raise ValueError(f"{position=} m, {velocity=} m/s, {load=} N: must be finite (position may be NaN: lifted)")
-        with self._writing:
-            self._slot["position"], self._slot["velocity"], self._slot["load"] = position, velocity, load
-            self._slot["finger_changes"] += 1
-        self._hand_over()
+        self._set("finger_changes", position=position, velocity=velocity, load=load)
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
-        self._slot["gain"] = number("gain", gain)
-        self._hand_over()
+        self._set(gain=number("gain", gain))
 
     def watch(self, seconds: float | None = None) -> None:
         """Stop the drive permanently once neither this nor `alive` has been called for so long (s); None: never."""
-        self._slot["watchdog"] = 0.0 if seconds is None else seconds * self.rate
-        self._count_call()
+        self._set("calls", watchdog=0.0 if seconds is None else seconds * self.rate)
 
     def alive(self) -> None:
         """Note a call of the application, for the watchdog."""
         if self._slot["watchdog"][0] > 0.0:
-            self._count_call()
-
-    def _count_call(self) -> None:
-        with self._writing:
-            self._slot["calls"] += 1
-        self._hand_over()
+            self._set("calls")
 
     def foreseen(self, seconds: float) -> tuple[Any, Array]:
         """Return the entry as it was between its last two blocks, and the finger's path from then on (m, shape (2, n)).
@@ -287,8 +276,7 @@ class RealtimeEntry(Addressed):
 
     def silence(self) -> None:
         """Set zero drive from the next block on, whatever is sensed."""
-        self._slot["playing"] = 0
-        self._hand_over()
+        self._set(playing=0)
 
     def log(self, start: int) -> dict[str, Array]:
         """Signals from sample `start` on, as far back as they are kept (`LOG_TIME`).
@@ -339,7 +327,12 @@ class RealtimeEntry(Addressed):
         """Calls that were refused, and got zeros, because they did not fit."""
         return int(self._entry["refused"][0])
 
-    def _hand_over(self) -> None:
+    def _set(self, counted: str = "", **values: float) -> None:
+        """Set fields of the slot, count a change, and hand it over."""
         with self._writing:
+            for name, value in values.items():
+                self._slot[name] = value
+            if counted:
+                self._slot[counted] += 1
             self._slots[self._back] = self._slot[0]
             self._back = int(publish(self.user_data + MIDDLE_AT, self._back))

@@ -160,7 +160,7 @@ CONTRADICTED = r"differs from its model, profile plate 3 \(A. Smith, 2026-11-22\
 def test_a_profile_that_a_run_contradicts_is_named_and_live_once_with_the_figure_of_render(
     plate, tmp_path, simulation, warned, method
 ):
-    """At the session's end, and in every recording; 11 % of stiffness are stated to 0.2, as `render` states them."""
+    """At the session's end, and in every recording; what the controller adds is stated to 0.2 %, as by `render`."""
     scene = hr.Scene(**fields(plate), simulation=simulation, method=method)
     named, noted = (pytest.warns(hr.PlateMismatch, match=warned) if warned else nullcontext() for _ in range(2))
     with named:

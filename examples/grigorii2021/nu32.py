@@ -109,8 +109,7 @@ class NU32Board(OpenedInWith):
         index, amplitude = self._tone
         self._set_closed_loop()
         sent = f"{amplitude / MILLIMETRE:.6f}"
-        self._send("a", sent, str(index))
-        self._echo("a")
+        self._command("a", sent, str(index))
         reply = self._reply("a")
         found = reply.split("\t")
         if len(found) != 4 or found[::2] != ["amp", "frequency"]:
@@ -147,13 +146,9 @@ class NU32Board(OpenedInWith):
                 break
         raise self._unexpected("f", reply, "closed loop turned on")
 
-    def _command(self, letter: str) -> None:
-        self._send(letter)
-        self._echo(letter)
-
-    def _echo(self, letter: str) -> None:
-        reply = self._reply(letter)
-        if reply != letter:
+    def _command(self, letter: str, *numbers: str) -> None:
+        self._send(letter, *numbers)
+        if (reply := self._reply(letter)) != letter:  # the echo
             raise self._unexpected(letter, reply, letter)
 
     def _send(self, *lines: str) -> None:
