@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import make_bands
 
-from examples.grigorii2021.nu32 import FAST_CLOCK, FREQUENCIES, MOST, NU32Board
+from hapticrender.drivers.nu32 import FAST_CLOCK, FREQUENCIES, MOST, NU32Board
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError, ProtocolError
 
 FRESH = [(b"z\n", b"CONNECTED\n\r"), (b"z\n", b"z\r\n")]

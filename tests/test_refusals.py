@@ -13,13 +13,13 @@ from test_kernel import plate_controller
 from waves import Own
 
 import hapticrender as hr
-from examples.grigorii2021.nu32 import NU32Board
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.loopshape import reduced_controller
 from hapticrender.control.methods import Resonant, method_named
 from hapticrender.drivers import protocol
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.drivers.base import BaseDriver
+from hapticrender.drivers.nu32 import NU32Board
 from hapticrender.drivers.serial import BoardClient
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
