@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from test_page import Reader
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.analysis import output, pictures
-from hapticrender.analysis.load_law import LoadLaw, mean_exponent
 from hapticrender.analysis.records import LOADED, Impedance
 from hapticrender.touch.mechanics import LIGHT
 
@@ -56,19 +54,6 @@ def test_verb_writes_tables_pictures_and_a_summary(recorded, tmp_path, capsys):
     assert cli.main(["finger", str(path), "--out", str(out)]) == 2
     assert "is there: choose another folder, or add --force" in capsys.readouterr().err
     assert cli.main(["finger", str(path), "--out", str(out), "--force"]) == 0
-
-
-@pytest.mark.parametrize("grating", [{"frequency": 111.0}, {"wavelength": 1e-3}], ids=["fixed", "following"])
-def test_verb_draws_a_single_band(grating, tmp_path):
-    """A fixed carrier, and one that follows the finger, under a load that hardly changes."""
-    pytest.importorskip("matplotlib")
-    finger = hr.Finger.swiping(frequency=1.0, stroke=0.03, normal_load=0.4, touches=[(0.8, 2.2)], mechanics="light")
-    scene = hr.Scene(texture=hr.Grating(**grating, amplitude=10e-6), finger=finger, duration=3.0)
-    hr.render(scene).save(tmp_path / "recording.npz")
-    assert cli.main(["finger", str(tmp_path / "recording.npz"), "--out", str(tmp_path / "out")]) == 0
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert "time-1.png" in written
-    assert "load.png" not in written
 
 
 def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
@@ -124,18 +109,6 @@ def test_a_folder_has_every_picture_and_a_page_of_them(record, tmp_path):
     assert f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" in text
 
 
-def test_a_mean_exponent_is_weighted_and_its_error_widened_by_scatter():
-    one = LoadLaw(*np.array([[100.0], [0.1], [0.1], [1.0], [1.0], [1.0], [9.0]]))
-    apart, near = (replace(one, exponent=np.array([n]), standard_error=np.array([0.2])) for n in (1.1, 0.1))
-    missing = replace(one, exponent=np.array([np.nan]))
-    (mean,), (error,), _ = mean_exponent([one, near, missing], np.array([101.0]))
-    assert (mean, error) == pytest.approx((0.1, 0.2 / np.sqrt(5)))  # weights 100 and 25
-    (mean,), (error,), _ = mean_exponent([one, apart], np.array([101.0]))
-    assert mean == pytest.approx((100 * 0.1 + 25 * 1.1) / 125)
-    assert error == pytest.approx(np.sqrt((100 * 0.2**2 + 25 * 0.8**2) / 125))
-    assert np.isnan(mean_exponent([one], np.array([200.0]))).all()
-
-
 def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     z, nothing = record.impedance, np.full(len(record.time), np.nan)
     masked = Impedance(z.time, z.frequency, z.value * np.nan, z.standard_error * np.nan, 0 * z.normal_load, z.position)
@@ -144,12 +117,3 @@ def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     shown, text = parsed(pictures.draw(lifted, tmp_path))
     assert shown == ["time-1.png"]
     assert re.search(r"Loaded</dt><dd>0\.00 of 4\.\d\d s, 0 touches", text)
-
-
-def test_without_matplotlib_there_is_a_page_and_a_warning(record, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.warns(UserWarning, match=r"no pictures: pictures need matplotlib: pip install"):
-        path = pictures.draw(record, tmp_path)
-    shown, text = parsed(path)
-    assert not shown
-    assert "matplotlib is not installed" in text
