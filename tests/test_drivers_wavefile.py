@@ -73,9 +73,9 @@ def test_integers_cut_what_is_beyond_full_scale_and_say_so(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")
-@pytest.mark.parametrize("ending", [".wav", ".w64", ".flac", ".rf64", ".aiff"])
+@pytest.mark.parametrize("ending", [".wav", ".flac", ".rf64"])
 def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
-    """All in WAV and W64; FLAC's encoder holds back a block of 4096; RF64 and AIFF count frames when closed."""
+    """All in WAV; FLAC's encoder holds back a block of 4096; RF64 counts frames when closed."""
     path = tmp_path / f"a{ending}"
     script = f"""
         import os, signal
@@ -90,7 +90,7 @@ def test_a_killed_process_leaves_what_it_played(tmp_path, ending):
     assert done.returncode == -signal.SIGKILL
     played = np.repeat(np.arange(100) / 128, 1000)[:, None] * np.ones(2)
     held = read_back(path, full_scale=1.0)
-    if ending in (".rf64", ".aiff", ".aif"):
+    if ending == ".rf64":
         assert held.shape == (0, 2)
     else:
         assert len(played) - len(held) <= (4096 if ending == ".flac" else 0)
