@@ -404,11 +404,7 @@ class Player(Addressed):
                 self._loop.silence()
             with suppress(Exception):
                 if not self._clocked:
-<<<<<<< HEAD
-                    play_zeros(loop.rendering.device)
-=======
-                    play_zeros(self._loop.driver)
->>>>>>> cuta
+                    play_zeros(self._loop.rendering.device)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
 

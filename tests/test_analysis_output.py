@@ -1,7 +1,6 @@
 """The verb `finger`: what it prints, writes and refuses; its pictures and page show the record's own numbers."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -54,19 +53,6 @@ def test_verb_writes_tables_pictures_and_a_summary(recorded, tmp_path, capsys):
     assert cli.main(["finger", str(path), "--out", str(out)]) == 2
     assert "is there: choose another folder, or add --force" in capsys.readouterr().err
     assert cli.main(["finger", str(path), "--out", str(out), "--force"]) == 0
-
-
-@pytest.mark.parametrize("grating", [{"frequency": 111.0}, {"wavelength": 1e-3}], ids=["fixed", "following"])
-def test_verb_draws_a_single_band(grating, tmp_path):
-    """A fixed carrier, and one that follows the finger, under a load that hardly changes."""
-    pytest.importorskip("matplotlib")
-    finger = hr.Finger.swiping(frequency=1.0, stroke=0.03, normal_load=0.4, touches=[(0.8, 2.2)], mechanics="light")
-    scene = hr.Scene(texture=hr.Grating(**grating, amplitude=10e-6), finger=finger, duration=3.0)
-    hr.render(scene).save(tmp_path / "recording.npz")
-    assert cli.main(["finger", str(tmp_path / "recording.npz"), "--out", str(tmp_path / "out")]) == 0
-    written = {path.name for path in (tmp_path / "out").iterdir()}
-    assert "time-1.png" in written
-    assert "load.png" not in written
 
 
 def test_verb_names_the_recording_in_an_error(recorded, tmp_path, capsys):
@@ -131,12 +117,3 @@ def test_a_finger_that_never_touched_has_a_page(record, tmp_path):
     assert shown == ["time-1.png"]
     assert "se: standard error of one sample" not in text, "it lists no touch"
     assert "position is good to 1 mm" in text
-
-
-def test_without_matplotlib_there_is_a_page_and_a_warning(record, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.warns(UserWarning, match=r"no pictures: pictures need matplotlib: pip install"):
-        path = pictures.draw(record, tmp_path)
-    shown, text = parsed(path)
-    assert not shown
-    assert "matplotlib is not installed" in text

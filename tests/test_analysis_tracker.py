@@ -8,7 +8,7 @@ from waves import phasor
 import hapticrender as hr
 from hapticrender.analysis.contact import clear_sigmas
 from hapticrender.analysis.course import MotionFilter
-from hapticrender.analysis.lock_in import demodulate, tile, window_length
+from hapticrender.analysis.lock_in import demodulate, window_length
 from hapticrender.analysis.records import LOADED
 from hapticrender.analysis.smoothing import LocalLine, convolve, derivative_kernels, half_width, spread_of
 from hapticrender.analysis.tracker import LEAST_RATE
@@ -51,21 +51,6 @@ def test_local_line_has_the_response_and_noise_it_says(lookahead, rng):
         assert abs(np.mean(found[1000:, 1] ** 2 / predicted[1000:]) - 1) < 4 * np.sqrt(2 / independent)
 
 
-def test_local_line_at_an_edge_uses_only_what_is_inside(rng):
-    line = LocalLine(spread_of(10.0), RATE, half_width(spread_of(10.0), RATE))
-    n = line.behind + line.ahead + 1
-    inside = np.arange(n) > line.behind  # the fit's own sample is the last one outside
-    ratios = []
-    for _ in range(400):
-        signal = np.where(inside, 3.0 + rng.standard_normal(n), 1e6)[:, None]
-        level, _, of_level, _ = line.fit(signal, inside)
-        ratios.append((level[0, 0] - 3.0) ** 2 / of_level[0])
-    assert abs(np.mean(ratios) - 1) < 4 * np.sqrt(2 / 400)
-    assert of_level[0] > 3 * line.noise[0]
-    far = np.arange(n) > 1.9 * line.behind
-    assert np.isnan(line.fit(signal, far)[0]).all()
-
-
 def test_lock_in_separates_near_carriers_and_a_drift(rng):
     """Weighted least squares leave no crosstalk between constant amplitudes; noise is as predicted."""
     frequency = np.array([20.0, 31.0, 400.0])
@@ -84,14 +69,6 @@ def test_lock_in_separates_near_carriers_and_a_drift(rng):
             assert (np.abs(share - 1) < 4 / np.sqrt(200)).all()
         else:
             assert np.abs(error).max() < 1e-9
-
-
-def test_windows_lie_inside_the_spans():
-    inside = np.zeros(100, bool)
-    inside[10:50] = inside[60:75] = True
-    assert tile(inside, 10, 5, 3).tolist() == [15, 25, 35]
-    assert tile(inside, 10, 2, 3).tolist() == [12, 22, 32, 62]
-    assert tile(~inside & inside, 10, 0, 0).size == 0
 
 
 def test_force_noise_is_as_predicted(rng):

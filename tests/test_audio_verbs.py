@@ -66,7 +66,7 @@ def scene(tmp_path):
     """File of a scene on the card's profile."""
     (tmp_path / "card.toml").write_text(CARD)
     path = tmp_path / "tone.toml"
-    path.write_text(hr.Scene(device=str(tmp_path / "card.toml"), texture=TONE, duration=1.5).to_toml())
+    path.write_text(hr.Scene(device=str(tmp_path / "card.toml"), texture=TONE, duration=1.2).to_toml())
     return path
 
 
@@ -96,7 +96,7 @@ def test_a_card_is_identified_and_a_scene_on_its_profile_rendered_validated_and_
     profile = hr.DeviceProfile.load(found)
     assert profile.device["delay"] == ROUND_TRIP
     assert profile.uncertainty["delay"] < 0.1
-    scene.write_text(hr.Scene(device=str(found), texture=TONE, duration=1.5).to_toml())
+    scene.write_text(hr.Scene(device=str(found), texture=TONE, duration=1.2).to_toml())
     assert main(["render", str(scene), "--driver", TEXT, "--out", str(tmp_path / "out")]) == 0
     rendered = hr.Recording.load(tmp_path / "out" / "recording.au")
     assert rendered.header.delay == ROUND_TRIP + 3 * BLOCK
@@ -127,7 +127,7 @@ class Late(AudioDriver):
 PROBED = 225  # blocks: 0.3 s, after which the loop begins
 
 
-@pytest.mark.parametrize(("at", "periods"), [(PROBED + 1, 28), (PROBED + 400, 20), (PROBED + 400, 90)])
+@pytest.mark.parametrize(("at", "periods"), [(PROBED + 1, 28), (PROBED + 400, 90)])
 def test_python_may_be_late(plate, tmp_path, at, periods):
     """By up to 32 blocks all that was sensed meanwhile arrives, so that nothing seems to jump; beyond it is lost.
 
@@ -155,7 +155,10 @@ import jack_ring
 import numpy as np
 
 import hapticrender as hr
+import hapticrender.player
+from hapticrender.drivers import portaudio
 
+hapticrender.player.TIMEOUT = portaudio.CLOSE_TIMEOUT = 2.0
 folder, program, how = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
 with ExitStack() as stack:
     server = stack.enter_context(ExitStack())
@@ -187,7 +190,7 @@ with ExitStack() as stack:
 
 LOST = {
     "ends": r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected",
-    "halts": r"DeviceTimeout: the device has played no sample for 5",
+    "halts": r"DeviceTimeout: the device has played no sample for 2",
 }
 
 
@@ -202,7 +205,7 @@ def test_a_card_that_goes_away_under_a_player_is_a_lost_device(jack_program, tmp
     done = subprocess.run(command, env=os.environ | paths, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert re.search(f"^hapticrender.errors.{LOST[how]}", done.stderr, re.M), done.stderr
-    assert "and while closing: audio:plate: close: PortAudio did not return within 8 s" in done.stderr
+    assert "and while closing: audio:plate: close: PortAudio did not return within 2 s" in done.stderr
     recording = hr.Recording.load(tmp_path / "lost.au")
     assert recording.flags[-1] == Flag.STOPPED
     assert not recording.drive[-1].any()

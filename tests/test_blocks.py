@@ -8,8 +8,6 @@ from test_kernel import IDEAL, RATE, plate_controller, tones, waveform_of
 
 import hapticrender as hr
 from hapticrender.control.controller_design import ONE_SPEED, design_controller
-from hapticrender.control.records import POSITION, SUM
-from hapticrender.control.sums import sum_bands, turn_tables
 from hapticrender.plants.plate import Plate
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer
 from hapticrender.touch.mechanics import HEAVY
@@ -26,23 +24,6 @@ def observer(p, y, carriers):
         envelope = envelope + g * np.outer(e, carriers[n].conj())
         dc, drift = dc + drift + p["dc"] * e, drift + p["dc_drift"] * e
     return envelope, dc
-
-
-@pytest.mark.parametrize("block", [25, 61, 64, 480])
-def test_carriers_follow_an_accelerated_finger_within_a_block(block):
-    """A group of 0.5 ms leaves an acceleration's a (T/2)^2/2 <= a T^2/8, 0.3 um at 10 m/s2, from the mean motion."""
-    bands = tones(np.zeros(2), 1e-30, wavenumber=[1000.0, 2000.0])
-    controller = plate_controller(bands, parameters=replace(IDEAL, rate=48000.0), delay=block, block=block)
-    controller.run(np.zeros((block, 2)), np.zeros(block), np.zeros(block))
-    samples, address = controller._arrays["samples"], controller.state.ctypes.data
-    time = np.arange(block) / 48000.0
-    position = 0.05 * time - 5.0 * time**2
-    samples[POSITION, :block] = position
-    controller._arrays["work"]["x_re"][::2] = controller.tiles["active"]
-    turn_tables(address)
-    sum_bands(address, 1, False)
-    exact = np.cos(2 * np.pi * np.outer(position, [1000.0, 2000.0])).sum(axis=1)
-    np.testing.assert_allclose(samples[SUM, :block], exact, rtol=0, atol=2 * np.pi * 3000.0 * 10.0 * (0.5e-3) ** 2 / 8)
 
 
 @pytest.mark.parametrize("block", [3, 64])
@@ -81,14 +62,6 @@ def test_a_recorded_waveform_is_analysed_in_blocks_as_sample_by_sample(block, rn
         )
     found = controller.field("raw_re") + 1j * controller.field("raw_im")
     np.testing.assert_allclose(found, raw, rtol=0, atol=1e-12 * abs(raw).max())
-
-
-def test_a_modulated_target_in_blocks_is_the_waveform_at_the_blocks_end():
-    controller = plate_controller(tones([47.0], 2e-6, modulated=True), delay=25, block=25)
-    wanted = 1.0 + 0.3 * np.sin(2 * np.pi * 3.0 * np.arange(2500) / RATE)
-    _, target, _ = controller.run(np.zeros((2500, 2)), np.zeros(2500), wanted)
-    late = slice(500, None)  # faded in after 250 samples
-    np.testing.assert_allclose(target[late][:, 0], 2e-6 * np.repeat(wanted[24::25], 25)[late], rtol=1e-12)
 
 
 def in_closed_loop(plant, controller, seconds):

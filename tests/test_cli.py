@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis
 import numpy as np
@@ -199,10 +198,14 @@ def test_a_drive_replaces_its_own_file_and_by_force_any_but_the_texture(run, tmp
         assert (played.read_bytes() == before) == bool(words)
 
 
-@pytest.mark.parametrize("verb", ["render {tiny} --out {out}", "play {tiny}", "identify"])
-@pytest.mark.parametrize("method", ["__enter__", "play"])
-@pytest.mark.parametrize(("fails", "line"), RAISED, ids=["raises", "divides", "exits"])
-def test_what_a_driver_raises_is_one_line(run, tiny, tmp_path, monkeypatch, verb, method, fails, line):
+VERBS = "render {tiny} --out {out}", "play {tiny}", "identify"
+WHERE = [*((verb, method, RAISED[0]) for verb in VERBS for method in ("__enter__", "play"))]
+WHERE += [(VERBS[0], "play", RAISED[1]), (VERBS[1], "__enter__", RAISED[2]), (VERBS[2], "play", RAISED[2])]
+
+
+@pytest.mark.parametrize(("verb", "method", "raised"), WHERE)
+def test_what_a_driver_raises_is_one_line(run, tiny, tmp_path, monkeypatch, verb, method, raised):
+    fails, line = raised
     monkeypatch.setattr(OtherPlate, method, fails)
     status, _, errors = run(*verb.format(tiny=tiny, out=tmp_path / "out").split(), "--driver", "other_plate:OtherPlate")
     assert (status, errors[-1]) == (2, line)
@@ -211,15 +214,6 @@ def test_what_a_driver_raises_is_one_line(run, tiny, tmp_path, monkeypatch, verb
 def test_python_in_development_mode_shows_the_traceback():
     command = [sys.executable, "-X", "dev", "-m", "hapticrender", "render", "a", "--out", "b", "--method", "magic"]
     assert "Traceback" in subprocess.run(command, capture_output=True, text=True, check=False).stderr
-
-
-def test_a_report_that_cannot_be_written_costs_no_other(run, tiny, tmp_path, monkeypatch):
-    """The table and the other report are there."""
-    monkeypatch.setattr("hapticrender.validate.write_json", lambda *_: Path("/no/such/folder/r.json").write_text(""))
-    status, out, errors = run("validate", tiny, "--json", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
-    assert (status, (tmp_path / "r.xml").exists()) == (2, True)
-    assert out.splitlines()[-1] == "1 scene: 1 not judged"
-    assert errors[-1] == f"hapticrender: --json = '{tmp_path}/r.json': No such file or directory"
 
 
 def test_nothing_of_others_is_overwritten(run, tmp_path):
@@ -240,27 +234,26 @@ def test_nothing_of_others_is_overwritten(run, tmp_path):
     assert run("render", own / "scene.toml", "--out", other)[0] == 0  # over an earlier run of its own
 
 
-REFUSING = {  # attribute of a driver, and what replaces it so that nothing is recorded; whether the probe runs
-    "it does not open": ("__enter__", lambda *_: 1 / 0, True),
-    "the probe refuses it": ("play", lambda driver, drive: PLAY(driver, -drive), True),
-    "its first block fails": ("play", lambda *_: 1 / 0, False),
-}
 PLAY = OtherPlate.play
 
 
-@pytest.mark.parametrize("case", REFUSING)
-def test_a_run_that_never_starts_leaves_the_earlier_one_and_refuses_no_other(run, tiny, tmp_path, monkeypatch, case):
-    name, fails, probe = REFUSING[case]
+@pytest.mark.parametrize(
+    ("fails", "probe"), [(lambda driver, drive: PLAY(driver, -drive), True), (lambda *_: 1 / 0, False)]
+)
+def test_a_run_that_never_starts_leaves_the_earlier_one_and_refuses_no_other(
+    run, tiny, tmp_path, monkeypatch, fails, probe
+):
+    """The probe refuses it, or its first block fails."""
     tiny.write_text(TINY + f"[render]\nprobe = {str(probe).lower()}\n")
     out, command = tmp_path / "out", ("render", tiny, "--out", tmp_path / "out", "--driver", PLATE)
     with monkeypatch.context() as patch:
-        patch.setattr(OtherPlate, name, fails)
+        patch.setattr(OtherPlate, "play", fails)
         assert run(*command)[0] == 2
         assert not out.exists()
     assert run(*command)[0] == 0
     before = {path: path.read_bytes() for path in out.iterdir()}
     with monkeypatch.context() as patch:
-        patch.setattr(OtherPlate, name, fails)
+        patch.setattr(OtherPlate, "play", fails)
         assert run(*command)[0] == 2
         assert not probe or {path: path.read_bytes() for path in out.iterdir()} == before
     assert run(*command)[0] == 0
@@ -471,11 +464,3 @@ def test_no_scene_file_ever_makes_a_traceback(run, tmp_path_factory, text):
     else:
         assert complaint(result).startswith(f"hapticrender: {path}: ")
         assert not (folder / "out").exists()
-
-
-def test_show_names_the_folders_that_hold_a_recording(run, tmp_path):
-    for name in ("one", "two"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "recording.au").touch()
-    folders = ", ".join(str(tmp_path / name) for name in ("one", "two"))
-    assert complaint(run("show", tmp_path)).endswith(f"recording.au: no such file; there is one in {folders}")

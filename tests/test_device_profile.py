@@ -180,18 +180,6 @@ def test_a_profile_that_a_run_contradicts_is_named_and_live_once_with_the_figure
         assert stated == pytest.approx(expected, abs=0.2)
 
 
-def stop(player):
-    player.play(hr.Grating(frequency=143.0, amplitude=30e-6))
-    player.sleep(2.0)
-    raise KeyboardInterrupt
-
-
-def test_live_play_that_ctrl_c_ends_names_it_too(plate):
-    named, ended = pytest.warns(hr.PlateMismatch, match=CONTRADICTED), pytest.raises(KeyboardInterrupt)
-    with named, ended, hr.Player(str(plate), paced=False, simulation=STIFF) as player:
-        stop(player)
-
-
 @pytest.mark.parametrize(("device", "frequency"), [("vt-plate", 72.0), ("hybrid", 50.0)])
 def test_an_inner_damper_that_was_turned_down_is_named(device, frequency):
     """Live and by `render`: a bending mode at 900 Hz that the model lacks; see `tests/test_supervisor.py`."""

@@ -19,7 +19,7 @@ from hapticrender.sampled_texture import SampledTexture
 
 RATE, SPEED, FULL = 5000.0, 0.08, 0.05  # Hz; m/s; s within which a texture is to be there
 TAIL = 0.05  # s: 4 to 8 periods
-SEEDS = range(4)
+SEEDS = range(2)
 QUIET = {"vt-plate": {"sensor_noise": 0.0}, "electroadhesion": {"force_noise": 0.0}} | dict.fromkeys(
     ("ultrasonic", "hybrid"), {"sensor_noise": 0.0, "force_noise": 0.0}
 )
@@ -77,7 +77,7 @@ def check_full(change, signals, flags, rate):
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_texture_is_there_within_50_ms_and_steps_no_more_than_at_a_start(case):
-    """Without noise; with that of four seeds a step is larger by five sigmas of what noise adds to a start's at most.
+    """Without noise; with that of two seeds a step is larger by five sigmas of what noise adds to a start's at most.
 
     The sigma is that of all seeds from 50 to 200 ms after the start.  What fades out of the old texture counts as an
     error for friction's law, which adds up to 1.2 % to the drive; a converter rounds the plate's by a step either way.
@@ -191,18 +191,6 @@ def test_two_changes_at_once_come_one_after_the_other(change, rng):
     assert entry.running is second
     entry.process(quiet(rng, sum(CHANGE)))
     assert entry.running is third
-
-
-def test_a_controller_of_another_device_or_beside_the_textures_own_is_refused(change):
-    entry, _, second = change
-    texture = SampledTexture(grating(frequency=80.0), RATE)
-    entry.play(texture, second)
-    other = plate_controller(tones(140.0), parameters=PlateParameters())
-    with pytest.raises(ValueError, match="texture: plays under another controller"):
-        entry.play(texture, other)
-    other = plate_controller(tones(100.0), parameters=PlateParameters(), delay=10, block=10)
-    with pytest.raises(ValueError, match=r"controller\.block = 10: must be 1, as of the one before"):
-        entry.play(SampledTexture(grating(frequency=80.0), RATE), other)
 
 
 def figures(frequency, seconds=0.25):

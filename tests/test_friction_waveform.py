@@ -60,8 +60,10 @@ def test_white_noise_is_played_whole(device, finger):
     assert not (recording.flags & hr.Flag.SATURATED).any()
 
 
-@pytest.mark.parametrize("texture", [white(), white(rms=0.3e-6), hr.Grating(frequency=100.0, velocity=3e-3)])
-@pytest.mark.parametrize("finger", FINGERS)
+@pytest.mark.parametrize(
+    ("texture", "finger"),
+    [(white(), "light"), (white(rms=0.3e-6), "usual"), (hr.Grating(frequency=100.0, velocity=3e-3), "heavy")],
+)
 def test_a_moist_finger_that_nothing_states_fails_the_verdict(texture, finger):
     """Its gain is an eighth of the design's: the bias allows twice the swing, so that no law could play it whole."""
     scene = hr.Scene(
@@ -157,7 +159,7 @@ def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(mu, gain):
 
 
 @pytest.mark.parametrize("off", [1.0, 1.5])
-@pytest.mark.parametrize(("speed", "rms", "bound"), [(0.01, 0.5e-6, 0.05), (0.03, 3e-6, MUST), (0.1, 3e-6, MUST)])
+@pytest.mark.parametrize(("speed", "rms", "bound"), [(0.01, 0.5e-6, 0.05), (0.1, 3e-6, MUST)])
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound, off):
     """True friction is the law's, of the true amplitude; what the recording infers is within a point of it.
 
@@ -209,11 +211,11 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
     0.4 s/(2 * 0.05 N), 0.4 % for 1 mN; two standard deviations.  A sensor without noise costs nothing.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
+    way = np.sign(np.diff(finger.position(np.arange(11_000) / 10e3)))
     learned = 2 * FRICTION[0] * SlidingParameters().force_noise / (2 * FRICTION_NOISE)
 
     def signed(sample, sensed):
-        way = np.diff(finger.position(np.array([sample, sample + 1]) / 10e3))
-        return sensed._replace(sensed=sensed.sensed * np.sign(way), motion=None)
+        return sensed._replace(sensed=sensed.sensed * way[sample], motion=None)
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
     late = slice(5000, 9_500)

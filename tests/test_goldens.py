@@ -6,7 +6,7 @@ The rules, on what ``goldens/record.py`` has stored:
 * baselines: an error stays within 10 % and the floor, both ways, where they work, within 25 % where they fail (worst
   error of 10 % and more), and they still fail there;
 * floor: 2 standard deviations of the figure over seeds of the sensor noise, but at most a thousandth of the target, a
-  hundredth of what can be felt; where a case draws other noise than it did (`OTHER_NOISE`), all of the 2 deviations;
+  hundredth of what can be felt;
 * target: within 1 %;
 * flags: the same bits, each for the first time within 5 ms;
 * drive within 1e-6 of its peak, where the arithmetic is the same.
@@ -23,6 +23,8 @@ from goldens.play import play
 from goldens.record import ARRAYS, FIGURES
 
 STORED = json.loads(FIGURES.read_text(encoding="utf-8"))
+with np.load(ARRAYS) as stored:
+    DRIVES = {name.removesuffix("/drive"): values for name, values in stored.items() if name.endswith("/drive")}
 ERRORS = ("worst", "rms", "peak", "complex")
 BOUNDED = (*ERRORS, "wobble", "residual", "drive_rms", "drive_peak")  # must not grow with the default method
 MORE, OFF, OFF_FAILING, OFF_TARGET = 0.1, 0.1, 0.25, 0.01  # share of the stored figure
@@ -49,7 +51,6 @@ CHANGED = {  # contact raises the gains a sample earlier, the law takes the fing
     "ultrasonic-touch",
 }
 SAME_ARITHMETIC = set(CASES) - ROUNDED - CHANGED
-OTHER_NOISE: set[str] = set()  # cases whose sensor noise comes in another order than when they were recorded
 
 
 @functools.cache
@@ -57,18 +58,12 @@ def played(name):
     return play(CASES[name])
 
 
-@functools.cache
-def arrays():
-    with np.load(ARRAYS) as stored:
-        return dict(stored)
-
-
 def found_of(case, run):
     return {"figures": judge.figures(run, case.window, case.settle), "flags": judge.flags(run)}
 
 
 def stored_of(name):
-    return STORED["cases"][name] | {"window": CASES[name].window, "other_noise": name in OTHER_NOISE}
+    return STORED["cases"][name] | {"window": CASES[name].window}
 
 
 def complaints(found, stored):
@@ -83,11 +78,8 @@ def complaints(found, stored):
 
 def floor_of(key, stored):
     """What noise alone may add to a figure, in its unit."""
-    noise = DEVIATIONS * stored["spread"][key]
-    if stored["other_noise"]:
-        return noise
     in_unit = {"wobble": "target", "residual": "target", "drive_rms": "drive_rms", "drive_peak": "drive_peak"}
-    return min(noise, FLOOR * (stored["figures"][in_unit[key]] if key in in_unit else 1.0))
+    return min(DEVIATIONS * stored["spread"][key], FLOOR * (stored["figures"][in_unit[key]] if key in in_unit else 1.0))
 
 
 def complaints_of_target(target, stored):
@@ -124,15 +116,9 @@ def complaints_of_flags(found, stored):
             yield f"{name} first at {found[name]['first']} s: must be at {stored[name]['first']} s within {LATER} s"
 
 
-def assert_same_drive(name):
-    """Compare drive within 1e-6 of its peak, at the start, in the middle and at the end of a run."""
-    stored = arrays()[f"{name}/drive"]
-    np.testing.assert_allclose(judge.drive_of(played(name)), stored, rtol=0, atol=1e-6 * abs(stored).max())
-
-
 def test_the_cases_are_the_stored_ones():
     assert set(STORED["cases"]) == set(CASES)
-    assert {name.split("/")[0] for name in arrays()} == set(CASES)
+    assert set(DRIVES) == set(CASES)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -142,4 +128,5 @@ def test_figures_and_flags_are_kept(name):
 
 @pytest.mark.parametrize("name", sorted(SAME_ARITHMETIC))
 def test_drive_is_the_same_where_the_arithmetic_is(name):
-    assert_same_drive(name)
+    """Within 1e-6 of its peak, at the start, in the middle and at the end of a run."""
+    np.testing.assert_allclose(judge.drive_of(played(name)), DRIVES[name], rtol=0, atol=1e-6 * abs(DRIVES[name]).max())

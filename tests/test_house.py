@@ -5,7 +5,6 @@ import doctest
 import graphlib
 import importlib
 import inspect
-import os
 import pkgutil
 import re
 import subprocess
@@ -385,16 +384,3 @@ def test_every_test_that_the_page_on_safety_names_is_there():
         elif word.startswith("..._"):
             pattern = re.escape(word).replace(re.escape("..."), ".*")
             assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
-
-
-@pytest.mark.parametrize(
-    ("there", "status", "said"), [({}, 0, "skipped"), ({"HAPTICRENDER_PACKAGES": "there"}, 1, "failed")]
-)
-def test_what_is_skipped_for_want_of_a_package_fails_where_all_are_there(there, status, said):
-    """As in `.ci/run`; here no program at all is found."""
-    environment = {name: value for name, value in os.environ.items() if name != "HAPTICRENDER_PACKAGES"}
-    command = [sys.executable, "-m", "pytest", "-q", "-k", "memory_of_a_board", ROOT / "tests" / "test_firmware_m4.py"]
-    options = {"env": environment | there | {"PATH": ""}, "cwd": ROOT, "capture_output": True, "text": True}
-    done = subprocess.run(command, **options, check=False)
-    assert done.returncode == status, done.stdout
-    assert f" {said}, " in done.stdout

@@ -193,13 +193,6 @@ def test_the_command_line_takes_any_driver_by_its_module(capsys):
     assert "10 times the noise: check drive and sensor connections, or increase amplitude" in capsys.readouterr().err
 
 
-def test_python_takes_the_same_texts_as_the_command_line():
-    assert identify("other_plate:OtherPlate:0.04", PAPER).parameters.mass == pytest.approx(0.04, rel=1e-3)
-    assert identify("simulated", PAPER).parameters.mass == pytest.approx(PAPER.mass, rel=1e-3)
-    with pytest.raises(ValueError, match="driver 'tea' is not installed"):
-        identify("tea", PAPER)
-
-
 def test_no_more_is_played_than_the_driver_can():
     """With a converter that rounds up, too: by `drive_limit` the lines are smaller, and less well determined."""
     limit = 0.5
@@ -212,12 +205,6 @@ def test_no_more_is_played_than_the_driver_can():
         step = PlateParameters(current_bits=bits).current_step
         assert limit - 1.5 * step - 1e-9 <= max(played) <= limit
         assert identified.parameters.mass == pytest.approx(TRUTH["mass"], rel=0.01)
-
-
-def test_a_delay_that_the_driver_states_is_no_difference(monkeypatch, capsys):
-    monkeypatch.setattr("other_plate.Block", lambda: OtherPlate(block=4, told=6, delay=6), raising=False)
-    assert cli.main(["identify", "--driver", "other_plate:Block"]) == 0
-    assert "differs from [device]: delay" not in capsys.readouterr().out
 
 
 def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):

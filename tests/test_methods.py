@@ -242,21 +242,3 @@ def test_one_wild_position_moves_nothing(method):
         after = np.concatenate([spoilt, bench.run(1500)[1]])
         motion[way] = abs(after - after.mean()).max()
     assert motion[0.05] < 1.6 * max(motion[0.0], 1e-5)
-
-
-@pytest.mark.parametrize("method", ["paper", "paper-common", "h", "h2"])
-def test_phase_is_right_again_soon_after_a_reversal(method):
-    """80 mm/s over 0.25 mm is 320 Hz, where the plant lags by 180 deg and the delay by 35 deg.
-
-    The command phase makes up for a lag that does not care about the finger's direction; conjugated with the
-    envelopes (naive) it was off by twice the lag, 16 deg for a third of a second.
-    """
-    parameters = PlateParameters(sensor_noise=0.0, sensor_bits=0, current_bits=0)
-    finger = hr.Finger.sliding(speed=0.08, span=0.08, normal_load=0.0, mechanics="none")
-    controller = METHODS[method].design(parameters.device_model(RATE, 1), make_bands(0.0, 1e-6, 4e3))
-    plate = Plate(parameters, finger)
-    sensed = plate.closed_loop(controller, np.zeros(12_500))[3]  # turns at 0.5, 1.5, 2.5 s
-    n = np.arange(8250, 9000)  # 150 to 300 ms after a turn
-    carrier = np.exp(-2j * np.pi * 4e3 * sensed.position[n])
-    phase = np.angle(np.mean(sensed.motion[n, 0] * carrier))
-    assert abs(phase) < np.radians(5)

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from synthetic import make_bands, make_play, make_recording, times
+from synthetic import make_bands, make_recording, times
 
 UM = 1e-6
 
@@ -47,13 +47,6 @@ def test_the_panels_show_what_was_recorded():
     assert "misses its tolerance" in figure.axes[0].texts[-1].get_text()
 
 
-def test_a_texture_without_bands_is_drawn_as_a_waveform():
-    wave = 10 * UM * np.cos(2 * np.pi * 100 * times(2.0))
-    figure = picture.draw(make_play(wave, 0.9 * wave))
-    assert len(panel(figure, "Waveform from").get_lines()) == 2
-    assert line(panel(figure, "Third octaves"), "end 1")[1].max() == pytest.approx(10.0)
-
-
 @pytest.mark.parametrize(("samples", "late"), [(0, 0.0), (1, 0.0), (60, 0.0), (10_000, np.nan), (10_000, 1e200)])
 def test_the_shortest_runs_and_motions_that_are_no_numbers_are_drawn(tmp_path, samples, late):
     bands, scene = make_bands(100.0, 10 * UM), {"duration": max(samples / 5000, 1.0)}
@@ -71,12 +64,6 @@ def test_a_picture_that_fails_leaves_the_older_one(tmp_path):
         figures.save(figure, path)
     assert path.read_bytes() == b"older"
     assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize(("suffix", "magic"), [(".png", b"\x89PNG"), (".PDF", b"%PDF")])
-def test_the_ending_chooses_the_format(tmp_path, suffix, magic):
-    assert swiped().plot(tmp_path / f"x{suffix}")
-    assert (tmp_path / f"x{suffix}").read_bytes().startswith(magic)
 
 
 def test_without_matplotlib_a_warning_names_the_extra_and_the_script_goes_on(tmp_path, monkeypatch):

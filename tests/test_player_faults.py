@@ -158,7 +158,7 @@ def moved_after(plate):
 
 
 SWAPS = [  # frequency, load, and bounds of time (s) and motion (m): a tone more than before, or docs/safety.md's 1.2 mm
-    *((frequency, load, 6e-3, 100e-6) for frequency in (20.0, 72.0, 189.0) for load in (0.8, 2.0)),
+    *((frequency, load, 6e-3, 100e-6) for frequency, load in ((20.0, 0.8), (72.0, 2.0), (189.0, 0.8))),
     (400.0, 0.8, 0.2, 1.25e-3),
 ]
 
@@ -178,8 +178,7 @@ def test_sensors_that_are_swapped_live_stop_the_drive_under_a_finger_off_the_mid
     assert motion < most
 
 
-@pytest.mark.parametrize("load", [0.8, 2.0])
-@pytest.mark.parametrize("frequency", [20.0, 72.0, 189.0, 400.0])
+@pytest.mark.parametrize(("frequency", "load"), [(20.0, 2.0), (72.0, 0.8), (189.0, 2.0), (400.0, 0.8)])
 def test_sensors_that_are_swapped_live_under_a_finger_on_the_middle_do_little(frequency, load):
     """Their mean is the heave still, and each shows the true size of an end's motion.
 
@@ -385,14 +384,14 @@ def test_a_recording_that_a_full_disk_cuts_off_is_an_error_once(tmp_path):
 
 def test_play_ends_in_an_error_where_the_disk_is_full(tmp_path, capsys):
     """Status 2, with the folder and why; the page about what is there is written."""
-    (tmp_path / "live.toml").write_text(hr.Scene(texture=TONE, duration=4.0, name="live").to_toml())
-    with full_disk(800_000):  # room for the picture, and for half of the recording
+    (tmp_path / "live.toml").write_text(hr.Scene(texture=TONE, duration=2.0, name="live").to_toml())
+    with full_disk(600_000):  # room for the picture, and for half of the recording
         assert main(["play", str(tmp_path / "live.toml"), "--out", str(tmp_path / "out")]) == 2
     printed = capsys.readouterr()
     assert f"hapticrender: {tmp_path / 'out'}: File too large" in printed.err
     assert "page: " in printed.out
     recording = Recording.load(tmp_path / "out" / "live" / "recording.au")
-    assert 0.1 < len(recording) / recording.rate < 3.9
+    assert 0.1 < len(recording) / recording.rate < 1.9
 
 
 def test_samples_that_were_not_kept_are_marked(tmp_path):

@@ -167,20 +167,6 @@ def test_a_texture_fades_in_and_another_fades_over_it(spatial, whole, rng):
     np.testing.assert_allclose(log["reference"][settled], expected[settled], rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("frames", [1, 64])
-def test_the_log_has_the_drive_of_the_call_before(frames, rng):
-    """Over two seconds and more, of which the log has all but nine samples."""
-    entry = RealtimeEntry(designed(False, True), frames=frames)
-    entry.play(SampledTexture(wave(False), RATE))
-    sensed = 1e-7 * rng.standard_normal((11_008, 2))
-    calls = [plain(entry, each)[0] for each in sensed.reshape(-1, frames, 2)]
-    log, played = entry.log(0), np.concatenate([np.zeros((frames, 2)), *calls])[: len(sensed)]
-    first = int(log["first"])
-    assert 0 < first <= len(sensed) - 2 * RATE + 8
-    np.testing.assert_array_equal(log["drive"], played[first:])
-    np.testing.assert_array_equal(log["sensed"], sensed[first:])
-
-
 def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_time_goes_on():
     n = round((HOLD + 0.2) * RATE)
     for texture, goes_on in ((wave(False), True), (wave(True), False)):
@@ -234,22 +220,6 @@ def test_a_gain_is_reached_without_a_step():
     plain_wave = wave(False).waveform((np.arange(2000) - entry.ahead) / RATE, 0.0)
     begin = 1000 + entry.ahead
     np.testing.assert_allclose(log[begin:], plain_wave[begin:] * smooth[: 1000 - entry.ahead], rtol=0, atol=1e-14)
-
-
-def test_a_texture_in_time_that_nobody_computes_fades_out():
-    """Two seconds are computed ahead; the rest by `fill`."""
-    starved, filled = (RealtimeEntry(designed(False, True)) for _ in range(2))
-    for entry in (starved, filled):
-        entry.play(SampledTexture(wave(False), RATE))
-        for _ in range(6):
-            plain(entry, np.zeros((2500, 2)))
-            if entry is filled:
-                entry.fill()
-    late = [entry.log(12500)["reference"] for entry in (starved, filled)]
-    assert abs(late[0]).max() == 0.0
-    assert abs(late[1]).max() == pytest.approx(1e-5, rel=0.02)  # 130 Hz is seen 38 times a turn: cos(pi/38) = 0.997
-    steps = abs(np.diff(starved.log(8000)["reference"]))
-    assert steps.max() < 1.05 * 1e-5 * 2 * np.pi * 130.0 / RATE  # no step where it ends
 
 
 def test_textures_that_have_faded_out_are_let_go():

@@ -26,7 +26,7 @@ from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
 from hapticrender.loop import prepare
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
-from hapticrender.plants.friction_laws import FitLaw, LoadSharing
+from hapticrender.plants.friction_laws import FitLaw
 from hapticrender.plants.hybrid import HybridPlant
 from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -34,9 +34,8 @@ from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.sampled_texture import SampledTexture
 from hapticrender.sweep import sweep
-from hapticrender.touch import latency_budget as budget
 from hapticrender.touch.mechanics import LIGHT_SECOND, NONE
-from hapticrender.touch.motion import Sampled, SineMotion, TriangleMotion
+from hapticrender.touch.motion import SineMotion
 from hapticrender.touch.motion_estimator import MotionEstimator
 from hapticrender.touch.perception import detection_threshold, drop_unfelt, from_velocity
 from hapticrender.touch.touch_panel import TouchPanel
@@ -162,17 +161,13 @@ TEXTURES = [
     (lambda: grating(amplitude=None, level=20, frequency=1001), r"level = 20.0: must be stated at 1 to 1000 Hz"),
     (lambda: grating(**IN_SPACE, level=20), r"speed is missing: must be .* m/s"),
     (lambda: grating(amplitude=10.0), r"amplitude = 10.0: must be .* <= 0.01 m"),
-    (lambda: grating(amplitude=True), r"amplitude = True: must be a finite number"),
     (lambda: grating(wavelength=1e-3), r"frequency, wavelength: exactly one must be given; frequency = 20.0"),
     (lambda: grating(shape="sawtooth"), r"shape = 'sawtooth': must be one of sine, square, triangle"),
     (lambda: grating(partials=[{"order": 1}]), r"partials\[0\] = .*: must be order, amplitude, phase"),
-    (lambda: grating(phase=10**400), r"phase = an integer beyond 1e30: must be .* rad"),
     (lambda: carriers(frequency=[np.nan, 1.0]), r"frequency\[0\] = nan: must be finite and >= 0 \(Hz\)"),
     (lambda: carriers(wavenumber=[0.0]), r"wavenumber has shape \(1,\): must be .* as many as frequency has"),
-    (lambda: carriers(envelope=[np.nan, 0.0]), r"envelope\[0\] = \(nan\+0j\): must be finite \(m\)"),
     (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0, 1.0]), "rate is missing"),
     (lambda: hr.Recorded(amplitude=1e-6, rate=9.0, samples=np.ma.masked_greater(np.arange(4.0), 2)), "masked: fill"),
-    (lambda: hr.Recorded(amplitude=1e-6, samples=[0.0], rate=100.0), "samples = .*: must be >= 2 numbers"),
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", rate=100.0), "rate = 100.0: must be left out, as the file has"),
     (lambda: hr.Recorded(amplitude=1e-6, file="a.wav", **WHITE), "file, samples: exactly one must be given"),
     (lambda: hr.Sum([(TONE, 1.0), ("tone", 1.0)]), r"parts\[1\] = .*: must be 1 to 4096 pairs of a texture and a num"),
@@ -185,9 +180,7 @@ TEXTURES = [
         "Own: must not change with time on a board: it is a function of position",
     ),
     (lambda: hr.Scene.from_toml_text(PARTS), r"texture\.parts\[1\]\[0\]\.kind = 'chimp': must be one of"),
-    (lambda: detection_threshold([20.0, -3.0]), r"frequency = .*: must be finite numbers >= 0 Hz$"),
     (lambda: detection_threshold(np.nan), r"frequency = .*: must be finite numbers >= 0 Hz$"),
-    (lambda: from_velocity(0.1, np.inf), r"frequency = .*: must be finite numbers > 0 Hz$"),
     (lambda: from_velocity(0.1, 0.0), r"frequency = .*: must be finite numbers > 0 Hz$"),
 ]
 FINGERS = [
@@ -202,56 +195,30 @@ FINGERS = [
     (lambda: hr.Scene(texture=TONE, finger=[SLIDE, SLIDE], duration=1.0), "finger: 2 fingers are stated: must be one"),
     (lambda: hr.Scene.from_toml_text(TWO_FINGERS), "finger: 2 fingers are stated: must be one"),
     (lambda: fitted(standard_error=0 * IMPEDANCE.standard_error), "standard_error = 0.0: must be > 0 N s/m"),
-    (lambda: hr.fit_finger(IMPEDANCE, loads=(3.0, 9.0)), "0 different carriers with data at loads from 3 to 9 N"),
-    (lambda: hr.fit_finger(IMPEDANCE, loads=(1.0, 0.5)), "loads = .*: must be two loads in N"),
     (lambda: hr.fit_finger(3), "impedance = 3: must be what analyse_finger returns"),
     (lambda: fitted(3), "order = 3: must be 2, 4 or None"),
     (lambda: fitted(2).interval("mass", 1), "level = 1: must be > 0 and < 1"),
-    (lambda: fitted(2).interval("tip"), "tip.*: must be one of mass, damping, stiffness, load_exponent"),
     (lambda: analysed(sensed_channels=1), "1 sensors in m: must be 2 in m"),
     (lambda: analysed(unit="N"), "2 sensors in N: must be 2 in m"),
-    (lambda: analysed(drive_channels=1), "1 drive channels: must be 2, one a coil"),
     (lambda: analysed(rows=4999), "0.9998 s long: must be >= 1 s"),
     (lambda: analysed(hr.DeviceProfile(kind="ultrasonic")), "profile.kind = 'ultrasonic': must be vt-plate"),
-    (lambda: analysed(3), "profile = 3: must be a DeviceProfile, PlateParameters, the path of"),
     (lambda: analysed(block=2), "block=2 samples: must be an integer from 1 to the plate's delay, 1"),
-    (lambda: hr.analyse_finger("/a.h5"), "recording = '/a.h5': must be a Recording: see Recording.load"),
-    (lambda: TriangleMotion(speed=-0.1), r"speed = -0.1: must be .* > 0 and <= 10 m/s"),
     (lambda: SineMotion(frequency=3.0), r"speed, stroke: exactly one must be given"),
-    (lambda: Sampled(positions=[0.0, np.nan], rate=1.0), r"positions\[1\] = nan: must be a finite number"),
-    (lambda: Sampled(positions=[0.0, 0.1], times=[1.0, 1.0]), r"times = .*: must be 2 rising times in s"),
 ]
 SENSORS = [
     (lambda: MotionEstimator(), "one must be > 1e-09 m"),
-    (lambda: MotionEstimator(1e-4, latency=-1.0), "latency = -1.0: must be a finite number >= 0 s"),
-    (lambda: MotionEstimator(1e-4).update(0.0, np.inf), "must be finite"),
-    (lambda: MotionEstimator(1e-4).update(1.0, 0.0, 0.0), "error = 0.0: must be a finite number > 0 m"),
     (lambda: hr.Encoder(0.5e-6, bits=70), "bits = 70: must be an integer >= 2 and <= 64"),
-    (lambda: hr.Encoder(0.0, noise=1e-6), "resolution = 0.0: must be the metres of a count, not 0"),
-    (lambda: hr.Encoder(0.5e-6).update(0.0, np.nan), "position = nan: must be a whole number of counts"),
     (lambda: hr.Encoder(0.5e-6).update(0.0, 2.5), "position = 2.5: must be a whole number of counts"),
-    (lambda: TouchPanel(rate=0.0), "rate = 0.0"),
-    (lambda: TouchPanel(noise=0.0, resolution=0.0), "one must be > 1e-09 m"),
     (lambda: hr.phase_error(PANEL, 0.05, 0.0), "wavelength = 0.0: must be a finite number > 0 m"),
-    (lambda: hr.phase_error(PANEL, np.nan, 1e-3), "speed = nan: must be a finite number >= 0 m/s"),
-    (lambda: hr.phase_error(PANEL, 0.05, 1e-3, frequency=0.0), "frequency = 0.0: .* > 0 Hz"),
-    (lambda: hr.phase_error(PANEL, 0.05, 1e-3, delay=-1e-3), "delay = -0.001: .* >= 0 s"),
-    (lambda: hr.phase_error(3, 0.05, 1e-3), "panel = 3: must be a TouchPanel"),
     (lambda: hr.finest_wavelength(PANEL, 0.05, degrees=0.0), "degrees = 0.0: .* > 0"),
-    (lambda: hr.finest_wavelength(PANEL, 0.05, highest=0.0), "highest = 0.0: must be > 0 Hz"),
-    (lambda: budget.settled_gain(MotionEstimator(1e-4), np.nan), "rate = nan: must be a finite number > 0 Hz"),
     (lambda: hr.Scene(texture=TONE, duration=1.0, touch_panel={"hz": 1}), "touch_panel.hz = .*: unknown key"),
     (lambda: hr.Player("vt-plate", touch_panel={"rate": 60.0}), "touch_panel: has no effect on the positions that"),
 ]
 TRACKER = [
     (lambda: tracker(lookahead=-1), "lookahead = -1: must be a finite number >= 0 s"),
     (lambda: tracker(rate=499.9), "rate = 499.9: must be a finite number >= 500 Hz"),
-    (lambda: tracker(rate=np.nan), "rate = nan: must be a finite number >= 500 Hz"),
-    (lambda: tracker(late=-1), "late = -1: must be an integer >= 0 samples"),
-    (lambda: tracker(noise=np.nan), "noise = nan: must be two numbers >= 0, in m rms"),
     (lambda: tracker(noise=[1e-6]), r"noise = array\(\[1.e-06\]\): must be two numbers"),
     (lambda: hr.FingerTracker(3), "plate = 3: must be a PlateParameters or a Course"),
-    (lambda: tracker().update(0.0, 0.0), r"shapes \(\) and \(\): must be \(1, 2\) and \(1, 2\), in A and m"),
     (
         lambda: tracker().update(A_COLUMN, np.zeros((5, 2))),
         r"shapes \(5, 1\) and \(5, 2\): must be \(5, 2\) and \(5, 2\)",
@@ -274,11 +241,8 @@ PLANTS = [
         lambda: UltrasonicParameters(**HOT),
         "temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
     ),
-    (lambda: FitLaw(floor=1.0), r"floor = 1.0: must be .*<= 0.999"),
-    (lambda: LoadSharing().ratio(1e-6, 0.0, 0.1), r"load = 0.0: must be .*> 0 .*N"),
     (lambda: FitLaw().amplitude(0.1, 0.5, 0.1), r"ratio = 0.1: must be .*>= 0.100001 .*and <= 1"),
     (lambda: hybrid(), r"plate.rate = 5000.0: must be 10000.0"),
-    (lambda: hybrid(rate=10e3, coils=1), r"plate.coils = 1: must be 2"),
     (lambda: hybrid(0.0, rate=10e3), r"velocity_per_force=0.0: must be > 0"),
 ]
 SCENES = [
@@ -291,10 +255,8 @@ SCENES = [
         lambda: limited("vt-plate", displacement=400.0),
         r"displacement = 400 m: must be <= 0.001 m, the sensors' range of",
     ),
-    (lambda: limited("vt-plate", peak_drive=-1), "limits.peak_drive = -1: must be a finite number > 0"),
     (lambda: limited("vt-plate", peak=1), "limits.peak = 1: unknown key; known: displacement, peak_drive, rms_drive"),
     (lambda: plate(19.0), "gradient = 19.0: must be <= 18.1818 1/m"),
-    (lambda: plate(coils=3), "device.coils = 3: must be .* <= 2"),
     (lambda: opened("electroadhesion", finger=hr.Finger.still(normal_load=1.0)), r"finger: must slide faster than 0.0"),
     (lambda: hr.prepare(STRONG), "asks for an attraction of 10.* N: must be <= 2.23 N, at 0.01 A under a nominal"),
     (lambda: hr.prepare(replace(STRONG, gradient=1.0)), "gradient = 1.0: must be 0 1/m"),
@@ -303,7 +265,6 @@ SCENES = [
     (lambda: opened("ultrasonic", bias=0.1), r"device.bias = 0.1: must be > 0.109, the least that the law leaves"),
     (lambda: opened("ultrasonic", scale=1e-4), "asks for a vibration of .* V under 0.4 N: must be <= 10 V"),
     (lambda: opened("ultrasonic", finger=hr.Finger.still(normal_load=0.4)), r"must slide faster than 0.001 m/s"),
-    (lambda: opened("ultrasonic", finger=hr.Finger.absent()), r"must slide faster|normal_load = 0"),
     (lambda: opened("ultrasonic", FAST), "0.313 N of friction: must be <= 0.144 N"),
     *(
         (lambda device=device: opened(device, RECORDED, velocity_per_force=0.0), "must be > 0 .* for a recording")
@@ -314,12 +275,9 @@ SCENES = [
         for device in ("electroadhesion", "ultrasonic")
     ),
     (lambda: sweep([TONE], at_a_time=0), "at_a_time = 0: must be an integer >= 1 scenes"),
-    (lambda: sweep(hr.Scene(texture=TONE, duration=1.0)), "scenes = Scene.*: must be scenes, in a list"),
     (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
     (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
-    (lambda: rendered(Own(lambda time, x: time[:-1])), r"Own.waveform returned float64 of shape \(\d+,\): must be"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
-    (lambda: opened("hybrid", current_limit=2.0), r"must be plate_current_limit or screen_current_limit"),
     (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5, carriers=6)), "a recording over time is not supported"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]
@@ -329,26 +287,16 @@ DRIVERS = [
     (lambda: RealtimeEntry(object()), "controller of type object: must have a compiled step"),
     (lambda: RealtimeEntry(in_blocks(), frames=64), "frames = 64: must be a multiple of the controller's block of 25"),
     (lambda: entry().finger(0.0, np.nan), "must be finite"),
-    (lambda: entry().set_gain(np.nan), "gain = nan"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
-    (lambda: driver(rate=1e9), r"BaseDriver: rate=1000000000.0 must be finite and > 0 Hz, and <= 1e\+07 Hz"),
     (lambda: driver(block=0), r"block=0 must be a whole number >= 1"),
-    (lambda: driver(sensed_channels=-1), r"sensed_channels=-1 must be a whole number >= 0"),
     (lambda: driver(delay=3), r"delay=3 must be a whole number >= 4"),
     (lambda: AudioDriver("0", channels=()), r"channels=\(\): must name at least one output"),
     (lambda: AudioDriver("0", channels=(0, 1)), r"channels=\(0, 1\): must be different whole numbers >= 1"),
-    (lambda: AudioDriver("0", sensed_channels=(3, 3)), r"sensed_channels=\(3, 3\): must be different"),
     (lambda: AudioDriver("0", drive_per_full_scale=0.0), "drive_per_full_scale = 0.0: must be a finite number > 0"),
-    (lambda: AudioDriver("0", sensed_per_full_scale=np.inf), "sensed_per_full_scale = inf: must be a finite number >"),
     (lambda: AudioDriver("0", delay=63.0), "delay=63.0 samples: must be >= block = 64 and <= 10 s"),
-    (lambda: AudioDriver("0", delay=np.nan), "delay=nan samples: must be >= block"),
-    (lambda: AudioDriver("0", rate=0.0), "rate=0.0 must be finite and > 0 Hz"),
     (lambda: WaveFileDriver("a.mp3"), r"a\.mp3: the ending '\.mp3' must be one of \.wav, \.w64"),
     (lambda: NU32Board("COM7", timeout=0.0), "timeout = .*: must be a finite number > 0 s"),
-    (lambda: NU32Board("COM7", timeout=np.inf), "timeout = .*: must be a finite number > 0 s"),
     (lambda: NU32Board("COM7").set_bands(make_bands([20.0, 47.0], 1e-6)), "bands: must be one fixed tone"),
-    (lambda: NU32Board("COM7").set_bands(make_bands(0.0, 1e-6, 1000.0)), "bands: must be one fixed tone"),
-    (lambda: BoardClient("x", timeout=-1e-9), r"timeout = .*: must be a finite number >= 0 s"),
     (lambda: BoardClient("x", reconnect=np.inf), r"reconnect = .*: must be a finite number >= 0 s"),
     (
         lambda: on_users("ultrasonic", rate=100e3),
@@ -377,17 +325,13 @@ DESIGNS = [
     (lambda: in_blocks().run(*map(np.zeros, ((30, 2), 30, 30))), "30 samples: must be a multiple of the block of 25"),
     (lambda: demodulator(frequency=[]), "at least one number"),
     (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
-    (lambda: demodulator(channels=0), "channels=0"),
     (lambda: demodulator().run(np.zeros((4, 2))), r"must be \(n, 1\)"),
     (lambda: StarSTDFT(bandwidth=2500.0, rate=5000.0), "bandwidth=2500.0 Hz must lie between 0 and half the rate"),
-    (lambda: StarSTDFT(bandwidth=np.nan, rate=5000.0), "bandwidth=nan Hz must lie between"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
-    (lambda: reduced_controller(-1.0, 5.0), "loop_bandwidth=-1.0 Hz: must be > 0 and below"),
     (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
     (lambda: exported(**BY_CARRIERS), "texture Synthetic: a board plays a whole waveform, without `carriers`"),
     (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),
     (lambda: exported(1), "bands = 1: must be 2 .* to 64"),
-    (lambda: exported(65), "bands = 65: must be 2 .* to 64"),
 ]
 KINDS = {
     "texture": TEXTURES, "finger": FINGERS, "sensor": SENSORS, "tracker": TRACKER, "plant": PLANTS, "scene": SCENES,

@@ -18,7 +18,7 @@ from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics
-from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
+from hapticrender.touch.recorded import Recorded, Synthetic
 from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
 
 GOOD = """
@@ -127,24 +127,13 @@ def test_a_texture_of_ones_own_is_described_but_not_played_again():
         again.texture.bands(5000.0)
 
 
-@pytest.mark.parametrize("texture", [TEXTURE_CASES["partials"], Swipe(file="a.npz", amplitude=1e-6)])
-def test_a_texture_over_position_needs_a_finger(texture):
-    with pytest.raises(ValueError, match="^finger.motion = 'none': a texture over position needs a finger$"):
-        Scene(texture=texture, duration=1.0)
-    assert Scene(texture=texture, finger=Finger.still(), duration=1.0).texture.spatial
-
-
 REFUSED = [  # text of GOOD, what stands there instead, message
     ("duration = 2.0", "", r"duration is missing: must be a finite number > 0 and <= 360000 s"),
-    ("duration = 2.0", "duration = inf", r"duration = inf: must be a finite number"),
     ("duration = 2.0", "duration = " + "9" * 6000, r"must be TOML"),
     ("duration = 2.0", "duration = 2.0\nlength = 1", r"length = 1: unknown key; known: calibration, device, duration"),
-    ("duration = 2.0", 'duration = 2.0\n"\\n" = 1', r"'\\n' = 1: unknown key"),
     ('kind = "grating"', 'kind = "gratin"', r"texture.kind = 'gratin': must be one of grating"),
     ("wavelength = 1e-3", "wavelenght = 1e-3", r"texture.wavelenght = 0.001: unknown key; known: amplitude, frequency"),
-    ("speed = 0.08", "speed = 80", r"finger.speed = 80: must be .* <= 10 m/s"),
     ('motion = "sliding"\nspeed = 0.08', 'motion = "none"', r"finger.motion = 'none': a texture over position needs"),
-    ("mass = 0.035", "mass = nan", r"profile.mass = nan: must be a finite number"),
     ("[device]", "[plant]", r"plant = .*: must be three tables: \[device\], \[simulation\].*\[render\]"),
     ("tolerance = 0.05", "tolerance = 5.0", r"tolerance = 5.0: must be .* > 0 and <= 1 \(a share: 0.05 is 5 %\)"),
     ("duration = 2.0", "duration = 2.0\ntolerance = 0.1", r"tolerance = 0.1: must be in the table \[render\]"),
@@ -159,15 +148,6 @@ def test_a_malformed_scene_is_refused_in_one_line(good, bad, message):
     with pytest.raises(SceneError, match=f"^scene.toml: ({message})") as refused:
         Scene.from_toml_text(GOOD.replace(good, bad), "scene.toml")
     assert len(str(refused.value).splitlines()) == 1
-
-
-def test_a_tolerance_may_be_the_whole_amplitude():
-    assert Scene.from_toml_text(GOOD.replace("tolerance = 0.05", "tolerance = 1.0")).tolerance == 1.0
-
-
-def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
-    (tmp_path / "scene.toml").write_text(GOOD, encoding="utf-8-sig")
-    assert Scene.from_toml(tmp_path / "scene.toml") == Scene.from_toml_text(GOOD)
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,11 @@ import multiprocessing
 import os
 import subprocess
 import sys
-import threading
-import time
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from hapticrender import jit, second_core
+from hapticrender import second_core
 from hapticrender.plants.plate_kernels import FUNCTIONS
 
 START = """
@@ -78,24 +76,6 @@ def test_a_child_does_not_outlive_its_parent(tmp_path):
         os.kill(pid, 0)
 
 
-@pytest.mark.parametrize("busy", [False, True], ids=["waits", "computes"])
-def test_what_takes_no_processor_time_is_not_announced_as_compiled(nothing_expected, monkeypatch, capsys, busy):
-    """As a load from the cache on a busy machine, or from a slow disk."""
-
-    def load(*_, **__):
-        end = now() + 5 * jit.ANNOUNCED_AFTER
-        while now() < end:
-            time.sleep(0.0 if busy else 0.01)
-        return lambda function: function
-
-    now = time.process_time if busy else time.monotonic
-    monkeypatch.setattr(jit, "ANNOUNCED_AFTER", 0.1)
-    monkeypatch.setattr(jit, "ANNOUNCED", threading.Event())
-    monkeypatch.setattr(jit.numba, "cfunc", load)
-    jit.CFunction(lambda: 0)._compiled  # noqa: B018
-    assert ("compiling" in capsys.readouterr().err) == busy
-
-
 def started(_=None):
     """Whether a child would be started here for a function that is expected; it is not waited for."""
     second_core.EXPECTED.add(("math", "sin"))  # has no address: the child fails
@@ -133,9 +113,3 @@ def test_no_child_without_a_second_core_or_an_interpreter(nothing_expected, monk
 def test_no_child_of_one_of_many_processes():
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         assert not any(pool.map(started, range(2)))
-
-
-def test_only_this_librarys_functions_are_expected(nothing_expected):
-    """Another module may do anything when it is imported."""
-    second_core.expect(started, FUNCTIONS["fill"].function)
-    assert second_core.EXPECTED == {("hapticrender.plants.plate_kernels", "fill")}

@@ -109,8 +109,9 @@ def test_a_plate_that_the_application_has_opened_is_left_at_zero_drive_by_identi
     assert not plate.played[-1].any()
 
 
-@pytest.mark.parametrize("verb", ["identify", "latency"])
-@pytest.mark.parametrize(("name", "status"), [("INT", 130), ("TERM", 143), ("HUP", 129)])
+@pytest.mark.parametrize(
+    ("verb", "name", "status"), [("identify", "INT", 130), ("identify", "TERM", 143), ("latency", "HUP", 129)]
+)
 def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tmp_path):
     """With the exit status that every verb has, also where the signal comes again while it closes the driver."""
     log = tmp_path / "played"
@@ -145,8 +146,7 @@ signal.raise_signal(int(sys.argv[3]))
 """
 
 
-@pytest.mark.parametrize("work", ["render", "player"])
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", -signal.SIGINT), ("SIGTERM", 143)])
+@pytest.mark.parametrize(("work", "name", "status"), [("render", "SIGTERM", 143), ("player", "SIGINT", -signal.SIGINT)])
 def test_a_run_in_a_daemon_thread_ends_at_zero_drive_with_the_program(work, name, status, tmp_path):
     """By Ctrl-C, or by SIGTERM where the application raises an exception, as docs/live.md says."""
     log = tmp_path / "played"

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from live_devices import Blind
 from plate_swipes import followed_on_a_plate
-from scipy.linalg import solve_discrete_lyapunov
 
 import hapticrender as hr
 from benchmarks.panels import PANELS
@@ -39,14 +38,6 @@ def bandwidth(estimator, rate):
     return float(grid[below[0]]) if below.size else 0.5 * rate
 
 
-def noise_errors(estimator, rate, ahead=0.0):
-    """Standard errors of position (m) and velocity (m/s), `ahead` (s) of the last sample, by its noise alone."""
-    a, b = budget._system(budget.settled_gain(estimator, rate), 1.0 / rate)
-    spread = estimator.variance * solve_discrete_lyapunov(a[:3, :3], np.outer(b[:3], b[:3]))
-    position, velocity, _ = np.sqrt(np.diagonal(transition(ahead) @ spread @ transition(ahead).T)).tolist()
-    return position, velocity
-
-
 def followed(estimator, rate, positions, ahead=0.0, gated=False):
     """Estimates `ahead` of every sample; where they are `gated`, the estimator may ignore one."""
     found = []
@@ -74,15 +65,6 @@ def test_the_filter_passes_what_it_predicts(rate, noise, ahead):
         assert abs(frequency_response(estimator, rate, half)[0]) ** 2 == pytest.approx(0.5, abs=2e-3)
     slow = frequency_response(estimator, rate, np.array([0.1]), ahead)[0]
     assert slow == pytest.approx(np.exp(0.2j * np.pi * ahead), abs=1e-4)  # no lag at low frequencies
-
-
-@pytest.mark.parametrize(("rate", "noise"), [(60.0, 1e-4), (240.0, 5e-5)])
-def test_the_filter_has_the_noise_that_it_predicts(rate, noise, rng):
-    estimator, ahead, apart = MotionEstimator(noise), 0.01, 12
-    found = followed(estimator, rate, noise * rng.standard_normal(8000), ahead)[100::apart]
-    predicted = noise_errors(estimator, rate, ahead)
-    # estimates so far apart are independent: the memory is some 3 samples at 60 Hz and 6 at 240 Hz
-    np.testing.assert_allclose(found.std(axis=0), predicted, rtol=5 / np.sqrt(2 * len(found)))
 
 
 def test_standard_errors_are_right_under_irregular_times(rng):
@@ -129,16 +111,6 @@ def held(panel, speed):
     return motion.position((time - panel.latency - age).ravel() + 10.0) - motion.position(time.ravel() + 10.0)
 
 
-def test_prediction_and_the_order_of_the_errors():
-    panel = PANELS["panel, 120 Hz, 15 ms"]
-    assert budget.position_error(panel, 0.05) < 0.5 * budget.position_error(panel, 0.05, predicted=False)
-    late = [budget.position_error(replace(panel, latency=each), 0.05) for each in (5e-3, 15e-3, 40e-3)]
-    assert sorted(late) == late
-    assert hr.finest_wavelength(panel, 0.05, degrees=30) == pytest.approx(12 * budget.position_error(panel, 0.05))
-    assert hr.finest_wavelength(panel, 0.1, highest=50.0) >= 2e-3
-    assert hr.phase_error(panel, 0.05, hr.finest_wavelength(panel, 0.05)) == pytest.approx(30.0)
-
-
 def test_dropouts_outliers_and_jitter_cost_no_more_than_the_budget_says(rng):
     panel, rate = TouchPanel(dropouts=0.05, jitter=1e-3), 1000.0
     truth = SineMotion(frequency=3.0, speed=0.05).position(np.arange(20_000) / rate)
@@ -175,15 +147,6 @@ def test_a_flick_is_followed_though_no_swipe_is_so_fast(speed):
     found = followed(MotionEstimator(50e-6), rate, truth, gated=True)
     assert abs(found[-20:, 0] - truth[-20:]).max() < 5 * 50e-6
     assert found[-20:, 1] == pytest.approx(speed, rel=0.05)
-
-
-def test_a_sample_may_state_its_own_error():
-    """Then it counts as one of a sensor with that error: a place found from the load is surer under a higher load."""
-    stated, plain = MotionEstimator(50e-6), MotionEstimator(1e-3)
-    for n in range(50):
-        for estimator, error in ((stated, 1e-3), (plain, None)):
-            estimator.update(n / 100, 0.02 * np.sin(OMEGA * n / 100), error)
-    assert stated.at(0.5) == pytest.approx(plain.at(0.5), rel=1e-12)
 
 
 def test_the_plate_alone_says_where_a_finger_of_400_mN_is_now(rng):

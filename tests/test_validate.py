@@ -89,13 +89,6 @@ def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, op
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("r", "older")]
 
 
-def test_a_report_goes_through_a_link(tmp_path, verdicts):
-    (tmp_path / "link").symlink_to(tmp_path / "r.json")
-    write_json(tmp_path / "link", verdicts)
-    assert (tmp_path / "link").is_symlink()
-    assert json.loads((tmp_path / "r.json").read_text())["hapticrender"]
-
-
 def test_a_scene_that_cannot_be_sent_to_another_process_stops_no_other():
     class Local(Grating):
         """Known to this process only."""
