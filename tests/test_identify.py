@@ -316,7 +316,8 @@ def test_a_record_that_lost_samples_is_played_again():
         assert abs(value - expected) < 3 * interval, name  # other noise: sqrt(2) times the interval, and some
     with OtherPlate(spoil=lambda sample, sensed: lose(sensed) if sample >= 3000 else sensed) as driver:
         spoiled.clear()
-        with pytest.raises(hr.DesignError, match=r"reports OVERRUN, in 10 tries: free .*--driver 'audio:NAME\?block"):
+        cures = r"--driver 'audio:NAME\?block.*'serial:PORT\?baud="
+        with pytest.raises(hr.DesignError, match=f"reports OVERRUN, in 10 tries: free .*{cures}"):
             identify(driver, PAPER)
         assert not driver.played[-1].any()
     assert len(spoiled) == 10 + 10  # and the zeros after each
