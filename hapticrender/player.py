@@ -116,8 +116,10 @@ class Player(Addressed):
             self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
-        self._parts: deque[tuple[Rendering, float]] = deque()  # of a playlist, and how long (s); the first plays ...
-        self._until = math.inf  # s: ... until then
+        self._parts, self._until = (
+            deque[tuple[Rendering, float]](),
+            math.inf,
+        )  # and s: of a playlist, the first until then
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
         self._loop: Any = None  # a `LiveLoop`, or that of a board, once something plays
@@ -402,8 +404,8 @@ class Player(Addressed):
             self._error = self._error or error
             with suppress(Exception):  # zero drive at once, on a device that may have failed
                 self._loop.silence()
-            with suppress(Exception):
-                if not self._clocked:
+            if not self._clocked:
+                with suppress(Exception):
                     play_zeros(self._loop.rendering.device)
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
