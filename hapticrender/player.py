@@ -116,10 +116,7 @@ class Player(Addressed):
             self._given, self._scene = None, partial(Scene, device=device, **fields)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
-        self._parts, self._until = (
-            deque[tuple[Rendering, float]](),
-            math.inf,
-        )  # and s: of a playlist, the first until then
+        self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
         self._loop: Any = None  # a `LiveLoop`, or that of a board, once something plays
