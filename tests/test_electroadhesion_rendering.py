@@ -149,10 +149,10 @@ def test_a_swipe_shows_its_area_where_it_turns():
 def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
     """Every sample is the envelope's times cos(2 pi k 5/48), over what the file's hold leaves of the carrier.
 
-    A phase counted in doubles modulo a turn loses at most 2^-53 turns a block, 1e-12 rad in these 1000 blocks.
+    The file's floats round to 2^-24 of full scale; a phase that slipped by a turn a million would be 6e-6 off.
     """
     full, droop = 10e-3, np.sinc(5 / 48)
-    driver = WaveFileDriver(tmp_path / "a.wav", rate=192_000, drive_channels=1, full_scale=full, subtype="DOUBLE")
+    driver = WaveFileDriver(tmp_path / "a.wav", rate=192_000, drive_channels=1, full_scale=full)
     scene = tone(100.0, duration=0.5, output="carrier")
     recording = hr.render(scene, driver=driver)
     file = read_back(driver.path, full_scale=full)[:, 0]
@@ -160,5 +160,5 @@ def test_the_carrier_starts_at_its_crest_and_keeps_its_phase(tmp_path):
     wanted = np.repeat(envelope, round(driver.rate / recording.rate))
     turns = np.array([float(Fraction(5 * k % 48, 48)) for k in range(48)])
     carrier = np.cos(2 * np.pi * np.resize(turns, len(wanted)))
-    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / droop, rtol=0, atol=1e-11 * full)
+    np.testing.assert_allclose(file[: len(wanted)], wanted * carrier / droop, rtol=0, atol=2**-24 * full)
     assert file[0] == pytest.approx(wanted[0] / droop)

@@ -159,7 +159,9 @@ def test_the_command_line_identifies_a_wrong_plate_and_render_then_holds_it(tmp_
     truth = {"mass": 30e-3, "stiffness_1": 24e3, "stiffness_2": 24.5e3, "sensor_gain_1": 1.02, "sensor_gain_2": 0.98}
     scene = hr.Scene(texture=hr.Grating(frequency=143.0, amplitude=30e-6), duration=3.0, simulation=truth)
     (tmp_path / "wrong.toml").write_text(scene.to_toml())
-    with pytest.warns(hr.PlateMismatch, match="at 143 Hz; remove the finger and take .*`hapticrender identify"):
+    with pytest.warns(
+        hr.PlateMismatch, match="the controller adds .* remove the finger and take .*`hapticrender identify"
+    ):
         before = amplitude(hr.render(scene).motion, 143.0, 1.0)
     arguments = ["identify", "--scene", str(tmp_path / "wrong.toml"), "--out", str(tmp_path / "plate.toml")]
     assert cli.main(arguments) == 0

@@ -247,7 +247,10 @@ PLANTS = [
 ]
 SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),
-    (lambda: limited("electroadhesion", displacement=1e-3), "displacement = 0.001: must be left out: a screen senses"),
+    (
+        lambda: limited("electroadhesion", displacement=1e-3),
+        "displacement = 0.001: must be left out: it bounds the sensors",
+    ),
     (lambda: hr.Synthetic(amplitude=1e-5, components=3, carriers=4), "carriers = 4: must be at most components = 3"),
     (lambda: limited("vt-plate", peak_drive=2000.0), r"peak_drive = 2000 A: must be <= 3 A, the largest drive of"),
     (lambda: limited("ultrasonic", rms_drive=500.0), r"rms_drive = 500 V: must be <= .* V, the largest drive of"),
