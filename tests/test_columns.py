@@ -1,5 +1,6 @@
 """Recordings of other programs: columns by name, with scales, from every format; what does not fit is refused."""
 
+import zipfile
 from contextlib import nullcontext
 
 import h5py
@@ -214,3 +215,20 @@ def test_only_counters_wrap(tmp_path):
     for signal in (made.drive, made.sensed):
         np.testing.assert_array_equal(signal[:, 0], [0, 1, 2, -32768, 32767, 0])
     np.testing.assert_array_equal(made.position - made.position[0], [0, 1, 2, 3, 2, 1])
+
+
+def test_what_is_no_array_and_what_lies_elsewhere_is_no_reason_to_refuse_a_file(tmp_path):
+    """A note in an NPZ file, and a virtual data set of an HDF5 file; a recording of our own may have neither."""
+    path = tmp_path / "a.npz"
+    np.savez(path, x=np.arange(4.0))
+    with zipfile.ZipFile(path, "a") as file:
+        file.writestr("readme.txt", "four numbers")
+    assert list(read_columns(path)) == ["x"]
+    with h5py.File(tmp_path / "source.h5", "w") as file:
+        file["t"] = np.arange(5.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        layout = h5py.VirtualLayout(shape=(5,), dtype="f8")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "source.h5"), "t", shape=(5,))
+        file.create_virtual_dataset("t", layout)
+        file["x"] = np.ones(5)
+    np.testing.assert_array_equal(read_columns(tmp_path / "a.h5")["t"], np.arange(5.0))

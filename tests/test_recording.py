@@ -379,3 +379,30 @@ def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp
     np.savez(tmp_path / "run.npz", **{name: value for name, value in (signals | changed).items() if value is not None})
     with pytest.raises(ValueError, match=message):
         Recording.load(tmp_path / "run.npz")
+
+
+def test_a_folder_that_is_missing_is_named_as_it_was_given(recording, tmp_path):
+    with pytest.raises(FileNotFoundError) as refused:
+        recording.save(tmp_path / "no" / "run.npz")
+    assert refused.value.filename == str(tmp_path / "no" / "run.npz")
+
+
+def test_files_that_would_grow_in_memory_are_refused(recording, tmp_path):
+    h5py = pytest.importorskip("h5py", reason="HDF5 is an extra")
+    header = recording.header.to_json()
+    np.savez_compressed(tmp_path / "bomb.npz", header=np.array(header), drive=np.zeros((1_000_000, 2)))
+    with h5py.File(tmp_path / "bomb.h5", "w") as file:
+        file["header"] = header
+        file.create_dataset("drive", (10**8, 2), "f8", chunks=(1000, 2), compression="gzip")  # 1.6 GB of nothing
+        file["unasked"] = np.zeros(3)
+    with h5py.File(tmp_path / "link.h5", "w") as file:
+        file["header"] = header
+        file["drive"] = h5py.ExternalLink("bomb.h5", "/unasked")
+    from scipy.io import savemat
+
+    savemat(tmp_path / "bomb.mat", {"header": header, "drive": np.zeros((1_000_000, 2))}, do_compression=True)
+    for name, message in (("bomb.npz", "bytes, the file"), ("bomb.h5", "bytes, the file"), ("bomb.mat", "bytes, the")):
+        with pytest.raises(ValueError, match=f"{name}: not a recording .drive has .* {message}"):
+            Recording.load(tmp_path / name)
+    with pytest.raises(ValueError, match="drive: is missing, or no data set of this file"):
+        Recording.load(tmp_path / "link.h5")

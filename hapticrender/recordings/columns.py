@@ -44,11 +44,11 @@ def read_columns(path: str | os.PathLike[str]) -> dict[str, Array]:
     require(ending in (*text, *CONTAINERS), "path", str(path), f"a file that ends in {', '.join((*text, *CONTAINERS))}")
     with path.open("rb"):  # a missing file is the same OSError for every format
         if ending in text:
-            found: dict[str, Any] = _read_text(path)
+            found: Mapping[str, Any] = _read_text(path)
         else:
             arrays, what = CONTAINERS[ending]
-            with naming_damage(path, f"damaged, or not {what}"):
-                found = arrays(path)
+            with naming_damage(path, f"damaged, or not {what}"), arrays(path) as opened:
+                found = {name: load() for name, (_, load) in opened.items()}
     columns: dict[str, Array] = {}
     others = []
     for name, values in found.items():

@@ -7,16 +7,17 @@ import os
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import require
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
 
+Arrays = dict[str, tuple[float, Callable[[], Any]]]  # of a file, by name: bytes (NaN: not here), and what reads it
 COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 
 
@@ -27,8 +28,8 @@ class MissingExtra(HapticError, ImportError):
 def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     """Read header and frames (n, columns) of a recording: .au, .npz, .h5, .hdf5, .mat or .csv.
 
-    An OSError where the file is not there or may not be read, a ValueError where it is damaged, or no recording
-    of this library, a `MissingExtra` where reading it takes an optional part that is not installed.
+    An OSError where the file is not there or may not be read, a ValueError where it is damaged, compressed, or no
+    recording of this library, a `MissingExtra` where reading it takes an optional part that is not installed.
     """
     path = Path(path)
     if path.suffix.lower() in SOUND_CONTAINERS:
@@ -121,10 +122,12 @@ def naming_damage(path: Path, problem: str = "not a recording") -> Iterator[None
         raise ValueError(f"{path}: {problem} ({reason})") from error
 
 
-def npz_arrays(path: Path) -> dict[str, Any]:
-    """Read the arrays of an NPZ file by name."""
+@contextmanager
+def npz_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of an NPZ file."""
     with path.open("rb") as opened, np.load(opened) as file:  # numpy leaves open what is no archive
-        return dict(file)
+        size = {each.filename: each.file_size for each in file.zip.infolist()}
+        yield {name: (size.get(f"{name}.npy", math.nan), partial(file.__getitem__, name)) for name in file.files}
 
 
 def _h5py() -> Any:
@@ -144,39 +147,57 @@ def _write_h5(path: Path, header: Header, frames: Any) -> None:
                 file[name].attrs["unit"] = units.get(name, header.unit)
 
 
-def h5_arrays(path: Path) -> dict[str, Any]:
-    """Read the data sets of an HDF5 file by name; links are not followed."""
-    h5py, found = _h5py(), dict[str, Any]()
+@contextmanager
+def h5_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of an HDF5 file; one that lies in another file has no size."""
+    h5py, found = _h5py(), Arrays()
 
     def take(name: str, entry: Any) -> None:
         if isinstance(entry, h5py.Dataset):
-            found[name] = entry[()]
+            size = math.nan if entry.external or entry.is_virtual else math.prod(entry.shape) * entry.dtype.itemsize
+            found[name] = size, partial(entry.__getitem__, ())
 
     with h5py.File(path, "r") as file:
-        file.visititems(take)
-    return found
+        file.visititems(take)  # which follows no link
+        yield found
 
 
-def mat_arrays(path: Path) -> dict[str, Any]:
-    """Read the arrays of a MAT file by name; those of version 7.3 are HDF5."""
-    from scipy.io import loadmat
+@contextmanager
+def mat_arrays(path: Path) -> Iterator[Arrays]:
+    """Provide the arrays of a MAT file; those of version 7.3 are HDF5."""
+    from scipy.io import loadmat, whosmat
 
     try:
-        found = loadmat(path, appendmat=False)
+        found = whosmat(path, appendmat=False)
     except NotImplementedError:
-        return h5_arrays(path)
-    return {name: values for name, values in found.items() if not name.startswith("__")}
+        with h5_arrays(path) as arrays:
+            yield arrays
+        return
+
+    def load(name: str) -> Any:
+        return loadmat(path, appendmat=False, variable_names=[name])[name]
+
+    yield {name: (math.prod(shape) * (1 if kind == "char" else 8), partial(load, name)) for name, shape, kind in found}
 
 
-def _reader(arrays: Callable[[Path], dict[str, Any]]) -> Callable[[Path], tuple[Header, Array]]:
-    """Reader of recordings that `write` has saved as arrays by name."""
+def _reader(arrays: Callable[[Path], Any]) -> Callable[[Path], tuple[Header, Array]]:
+    """Reader of recordings that `write` has saved as arrays by name, never compressed."""
 
     def read(path: Path) -> tuple[Header, Array]:
-        found = arrays(path)
-        require("header" in found, "header", None, "a text, as `write` saves it")
-        text = np.asarray(found["header"]).ravel()[0]
-        header = Header.from_json(text.decode() if isinstance(text, bytes) else str(text), str(path))
-        return header, join(header, found)
+        with arrays(path) as found:
+
+            def load(name: str) -> Any:
+                size, values = found.get(name, (math.nan, tuple))
+                most = path.stat().st_size
+                if math.isnan(size):
+                    raise ValueError(f"{name}: is missing, or no data set of this file")
+                if size > most:
+                    raise ValueError(f"{name} has {size} bytes, the file {most}: compressed recordings are not read")
+                return values()
+
+            text = np.asarray(load("header")).ravel()[0]
+            header = Header.from_json(text.decode() if isinstance(text, bytes) else str(text), str(path))
+            return header, join(header, {name: load(name) for name in header.slices})
 
     return read
 
