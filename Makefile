@@ -16,7 +16,7 @@ OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate
 # what they found at the end.
 REAL_TIME := tests/test_audio_jack.py tests/test_audio_verbs.py $(wildcard tests/test_player*.py) tests/test_board_live.py
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
-BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
+BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
 	nu32.py player_board.py)
 API := hapticrender $(addprefix hapticrender.,loop latency sweep realtime_entry validate protocols bands errors touch recordings analysis \
 	control plants renderers drivers)
@@ -28,10 +28,10 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 	@.venv/bin/hapticrender demo --out $(OUT)
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
-	@others=$$(mktemp); status=0; export MPLBACKEND=Agg; \
+	@others=$$(mktemp); status=0; export MPLBACKEND=Agg; trap 'cat "$$others"; rm "$$others"' EXIT; \
 	nice -n 19 $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS) >"$$others" 2>&1 & \
 	$(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS) || status=$$?; \
-	wait $$! || status=$$?; cat "$$others"; rm "$$others"; exit $$status
+	wait $$! || status=$$?; exit $$status
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)

@@ -237,11 +237,12 @@ class BoardLine:
             request.sent = now
             out += protocol.command(self.session, request.kind, request.sequence, request.payload)
         since = now - self._kept_alive + MICROSECOND
-        moved = self.finger is not self._pointed
+        finger = self.finger  # once: another thread may set it meanwhile
+        moved = finger is not self._pointed
         if self.session and since >= (FINGER_PERIOD if moved else KEEP_ALIVE):
-            self._kept_alive, self._pointed = now, self.finger
-            time = round(((self.finger.time if moved else now) - self._began) * 1e6) & 0xFFFFFFFF
-            kind, fields = (Kind.FINGER, self.finger[1:]) if moved else (Kind.HEARTBEAT, ())
+            self._kept_alive, self._pointed = now, finger
+            time = round(((finger.time if moved else now) - self._began) * 1e6) & 0xFFFFFFFF
+            kind, fields = (Kind.FINGER, finger[1:]) if moved else (Kind.HEARTBEAT, ())
             payload = protocol.pack(kind, time, *self.application, *fields)
             out += protocol.command(self.session, kind, self._next(), payload)
         self.sent_bytes += len(out)

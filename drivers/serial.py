@@ -54,7 +54,7 @@ class SerialDriver(BaseDriver):
 
     def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
         self.client, self.options = BoardClient(port, **options), options
-        self.finger, self._sent, self._begun = finger, 0, False
+        self.finger, self._sent, self._begun, self._last = finger, 0, False, np.full(1, np.nan)
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
             found = self.capabilities = client.capabilities
@@ -141,7 +141,8 @@ class SerialDriver(BaseDriver):
         envelope = np.zeros(0) if bands.envelope is None else bands.envelope
         target = np.tile(np.asarray(envelope, complex), (len(position), 1))
         if bands.differentiated:
-            speed = np.diff(position, prepend=position[:1]) * self.rate
+            speed = np.nan_to_num(np.diff(position, prepend=self._last) * self.rate)  # 0 as the finger touches
+            self._last = position[-1:]
             target *= 2j * np.pi * (bands.frequency + np.multiply.outer(speed, bands.wavenumber))
         return np.where(away & ((bands.wavenumber > 0.0) | bool(self.capabilities.friction)), 0.0, target)
 
@@ -155,8 +156,10 @@ class SerialDriver(BaseDriver):
         peak, step = rendering.scene.device_profile.limits.peak_drive or most, model.drive_step
         if step > 0.0 and peak < most:
             peak = step * math.floor(peak / step)  # what the converter rounds up would pass it
-        peak = min(peak, most)
-        self.client.limits(peak, min(model.rms_limit, peak), min(model.rms_time, LONGEST_MEAN), model.sensed_bound)
+        peak, rms, time = min(peak, most), model.rms_limit, model.rms_time
+        if self.capabilities.friction and (limits := rendering.scene.device_profile.limits).rms_drive:
+            rms, time = math.sqrt(2.0) * limits.rms_drive, limits.rms_time  # the board's is that of the carrier's peak
+        self.client.limits(peak, min(rms, peak), min(time, LONGEST_MEAN), model.sensed_bound)
 
     def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
         self._begun, client = True, self.client

@@ -180,6 +180,8 @@ def _checked(rendering: Rendering, playing: Bands, controller: Any, bands: int) 
         raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate and {SCREEN} only")
     if root and (root.straight or getattr(rendering.driver, "hold", 0)):
         raise ValueError("render: a board plays the envelope of a carrier by its square root, without other settings")
+    if not (root or rendering.driver.sensed_channels):
+        raise ValueError("driver.sensed_channels = 0: must be 1 or more on a plate's board, which is supervised")
     if scene.method != "inverse":
         raise ValueError(f'method = {scene.method!r}: a board plays "inverse" only, the default')
     if not isinstance(controller, WaveformController):

@@ -34,7 +34,7 @@ from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, not
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import opened, play_zeros, prepare, recorder_of, warn_of
+from hapticrender.loop import FADE_OUT, opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
@@ -394,18 +394,18 @@ class Player(Addressed):
             self._run(self._serve, device, lambda: getattr(loop, "computing", ""))
         return [rendering, *later]
 
-    def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] = str) -> None:
+    def _run(self, target: Callable[[], None], device: object, busy: Callable[[], str] | None = None) -> None:
         """Run `target` in a thread until the player stops; what it raises is kept for the application."""
 
         def failed(error: BaseException) -> None:
             self._error = self._error or error
             with suppress(Exception):  # zero drive at once, on a device that may have failed
                 self._loop.silence()
-            if not self._clocked:
+            if busy is None:  # the thread that plays: no other one may
                 with suppress(Exception):
                     play_zeros(self._loop.rendering.device)
 
-        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy)
+        self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy or str)
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""
@@ -485,7 +485,7 @@ class Player(Addressed):
             time.sleep(END_FADE)
         with suppress(*[] if self._error is None else [HapticError]):  # one that is lost cannot be silenced
             loop.silence()
-        end, limit = loop.samples + 2 * loop.driver.block, time.monotonic() + END_FADE
+        end, limit = loop.samples + 2 * loop.driver.block + FADE_OUT * loop.driver.rate, time.monotonic() + END_FADE
         while running and loop.samples < end and time.monotonic() < limit:
             time.sleep(1e-3)
         with self._lock:

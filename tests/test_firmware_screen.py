@@ -222,3 +222,23 @@ def test_careful_warnings_find_nothing(exports, kind):
 
 def test_it_compiles_for_a_cortex_m4(tmp_path):
     assert built(tmp_path, hr.prepare(SCREEN), "board-m4.elf").exists()
+
+
+def test_a_profiles_mean_square_reaches_the_board_and_targets_know_no_blocks(program, tmp_path, library):
+    """The board's is that of the carrier's peak, twice that of the carrier; one that touches has no speed."""
+    limited = hr.prepare(replace(SCREEN, texture=0.5 * RIDGES, limits={"rms_drive": 0.7e-3, "rms_time": 0.5}))
+    position = np.r_[np.linspace(0.0, 1e-3, 50), np.full(10, np.nan), np.linspace(2e-3, 3e-3, 40)]
+    with SteppedBoard(tmp_path, program=program) as board:
+        driver = board.driver()
+        with driver:
+            sent = []
+            driver.client.limits = lambda *values: sent.append(values)
+            driver.protect(limited)
+            assert sent[0][1:3] == (pytest.approx(np.sqrt(2.0) * 0.7e-3), 0.5)
+            whole = driver._targets(library[0], position)
+            driver._last = np.full(1, np.nan)
+            split = [driver._targets(library[0], part) for part in np.split(position, [25, 55, 70])]
+    np.testing.assert_array_equal(np.concatenate(split), whole)
+    assert np.isfinite(whole).all()
+    assert whole[25:49].all()
+    assert not whole[50:61].any()

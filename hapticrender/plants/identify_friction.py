@@ -140,7 +140,7 @@ def identify_screen(
         enough = f"more than {UNKNOWNS} periods of {1 / MODULATION:g} s, of which the first does not count"
         raise DesignError(f"finger: must slide in {enough}, for intervals of what is found")
     columns = np.column_stack([load, most**2 * (1 + np.cos(phase)) / 2, most**2 * np.sin(phase)])[sliding]
-    check_range(sensed.sensed[sliding], parameters.force_range, "N")
+    check_range(np.where(sliding[:, None], sensed.sensed, 0.0), parameters.force_range, "N")
     friction = abs(sensed.sensed[sliding, 0])  # as `render` takes it: it may keep the sign of the lateral force
     found = np.linalg.lstsq(columns, friction, rcond=None)[0]
     residual = friction - columns @ found
