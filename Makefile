@@ -12,8 +12,7 @@ RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
-# Tests that play in real time, one after the other, leave a core nearly idle: the others run beside them, and print
-# what they found at the end.
+# Tests that play in real time run first, one after the other; the rest on two cores.
 REAL_TIME := tests/test_audio_jack.py tests/test_audio_verbs.py $(wildcard tests/test_player*.py) tests/test_board_live.py
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_textures.py \
@@ -28,10 +27,8 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 	@.venv/bin/hapticrender demo --out $(OUT)
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
-	@others=$$(mktemp); status=0; export MPLBACKEND=Agg; trap 'cat "$$others"; rm "$$others"' EXIT; \
-	nice -n 19 $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS) >"$$others" 2>&1 & \
-	$(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS) || status=$$?; \
-	wait $$! || status=$$?; exit $$status
+	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
+	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
