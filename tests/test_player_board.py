@@ -19,6 +19,14 @@ WHITE = hr.Recorded(
 WANDERING = Own(lambda time, place: 5e-6 * np.sin(2 * np.pi * (60.0 * time + np.nan_to_num(place) / 2e-3)))  # m
 
 
+def slide(player, clock, seconds, start, speed):
+    """Slide over the plate by the board's clock (m, m/s), under 0.4 N."""
+    began = clock.monotonic()
+    while (slid := clock.monotonic() - began) < seconds:
+        player.finger(start + speed * slid, speed, 0.4)
+        player.sleep(0.01)
+
+
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
     return build_board(tmp_path_factory.mktemp("board"), hr.prepare(hr.Scene(texture=TONE, duration=1.0)))
@@ -50,17 +58,11 @@ def test_a_board_plays_live(program, tmp_path):
             player.sleep(0.5)
             [white] = player.state().bands
             player.play(replace(WHITE, speed=0.1) + 0.5 * hr.Chirp(start=50.0, stop=90.0, duration=1.0, amplitude=4e-6))
-            start = driver.client.clock.monotonic()
-            while (slid := driver.client.clock.monotonic() - start) < 0.6:
-                player.finger(-0.03 + 0.1 * slid, 0.1, 0.4)
-                player.sleep(0.01)
+            slide(player, driver.client.clock, 0.6, -0.03, 0.1)
             assert player.state().flags == hr.Flag(0)
             both = player.end_recording()
             player.play(hr.Grating(wavelength=1e-3, amplitude=4e-6))
-            start = driver.client.clock.monotonic()
-            while (slid := driver.client.clock.monotonic() - start) < 0.5:
-                player.finger(0.03 - 0.1 * slid, -0.1, 0.4)
-                player.sleep(0.01)
+            slide(player, driver.client.clock, 0.5, 0.03, -0.1)
             [ridges] = player.state().bands
             player.finger(-0.02, 0.0, 0.4)
             player.sleep(0.5)
@@ -89,10 +91,7 @@ def test_a_board_plays_a_texture_in_time_and_place_at_once(program, tmp_path):
             player.sleep(0.2)
             player.play(WANDERING)
             player.record(tmp_path / "wandering.au")
-            start = driver.client.clock.monotonic()
-            while (slid := driver.client.clock.monotonic() - start) < 0.8:
-                player.finger(-0.03 + 0.05 * slid, 0.05, 0.4)
-                player.sleep(0.01)
+            slide(player, driver.client.clock, 0.8, -0.03, 0.05)
             assert player.state().flags == hr.Flag(0)
             found = player.end_recording()
             player.play(TONE)
