@@ -66,7 +66,7 @@ def stopped(recording):
 
 
 @pytest.mark.parametrize("block", [1, 25])
-@pytest.mark.parametrize("error", [RuntimeError("the app broke"), KeyboardInterrupt(), MemoryError()])
+@pytest.mark.parametrize("error", [RuntimeError("the app broke"), KeyboardInterrupt()])
 def test_an_exception_in_the_application_ends_in_zero_drive(block, error):
     """The block in hand has been played; the next is zero, as many as it takes to come through."""
     plate = Logged(block=block, told=block, delay=block)
@@ -86,7 +86,7 @@ def scene(frequency=72.0, amplitude=20e-6, duration=1.0, **fields):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, name, status):
     """The command line on a device of one's own: what it was played last is zero, and the journal can be read."""
     log, out = tmp_path / "played", tmp_path / "out"

@@ -153,7 +153,7 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     """
     finger = hr.Finger.sliding(speed=speed, normal_load=0.4, span=0.18)
     device = watched(finger)
-    scene = hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", duration=0.6, settle=0.2)
+    scene = hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", duration=0.45, settle=0.2)
     recording = hr.render(scene, driver=device)
     p, steps = SurfaceParameters(), round(192e3 / recording.rate)
     amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
@@ -161,7 +161,7 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     kept = np.exp(-speed / 192e3 / p.memory_length)
     true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
     band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
-    late = slice(round(0.2 * recording.rate), round(0.55 * recording.rate))
+    late = slice(round(0.2 * recording.rate), round(0.4 * recording.rate))
     signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
     true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
     right, shown, other = (np.std(each - reference) / np.std(reference) for each in (true, inferred, 1.5 * true))
@@ -181,14 +181,14 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(16, 0.8) if tells else None
     device = watched(heavy, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
     recording = hr.render(
-        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.42, settle=0.2), driver=device
+        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.3, settle=0.2), driver=device
     )
     assert least < friction_of(np.concatenate(device.moved)[:, 0], 200.0, load=0.8) / (10e-3 / 0.64) < most
     assert recording.summary()["verdict"] != "passed"
 
 
-@pytest.mark.parametrize("wavelength", [1e-3, 0.5e-3])
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
+@pytest.mark.parametrize(("wavelength", "sensors"), [(1e-3, ("open", "closed")), (0.5e-3, ("open", "closed", "quiet"))])
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, sensors):
     """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
 
     Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise.  With
@@ -197,21 +197,22 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
     0.4 s/(2 * 0.05 N), 0.4 % for 1 mN; two standard deviations.  A sensor without noise costs nothing.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
-    way = np.sign(np.diff(finger.position(np.arange(11_000) / 10e3)))
+    way = np.sign(np.diff(finger.position(np.arange(8_000) / 10e3)))
     learned = 2 * FRICTION[0] * SlidingParameters().force_noise / (2 * FRICTION_NOISE)
 
     def signed(sample, sensed):
         return sensed._replace(sensed=sensed.sensed * way[sample], motion=None)
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
-    late = slice(5000, 9_500)
-    for name, sensor in {"open": {}, "closed": {"blind": False}, "quiet": {"blind": False, "force_noise": 0.0}}.items():
-        screen = Screen(finger=finger, tell=signed, **sensor)
-        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.0)
+    late = slice(3_333, 6_667)  # one swipe
+    for name in sensors:
+        quiet = {"force_noise": 0.0} if name == "quiet" else {}
+        screen = Screen(finger=finger, tell=signed, blind=name == "open", **quiet)
+        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=0.7)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors[name] = np.std(played - asked) / np.std(asked)
     assert max(errors.values()) < 0.02  # what the project has set itself
-    assert errors["quiet"] < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
+    assert errors.get("quiet", 0.0) < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
     assert errors["closed"] < (np.hypot(errors["open"], learned) if wavelength < 1e-3 else errors["open"] + 5e-4)
