@@ -9,7 +9,7 @@ from synthetic import make_bands
 from test_kernel import plate_controller, tones
 
 import hapticrender as hr
-from benchmarks.charts.poles import growth
+from benchmarks.charts.poles import growth, loop_poles
 from benchmarks.charts.stability_map import loaded_plate
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.damping import damping_taps, oscillators
@@ -205,3 +205,16 @@ def test_nyquists_count_agrees_with_the_poles(frequencies, level):
     for delay in (1, 8):
         loop = replace(error_loop(MODEL, at(*frequencies), SETTINGS, level, taps=TAPS), delay=delay)
         assert loop.margins().stable == (growth(loop) < 0.02), delay
+
+
+def test_poles_and_frequency_response_are_of_one_loop():
+    """The return difference vanishes at every closed-loop pole, relative to its size 1 1/s beside it."""
+    free = error_loop(MODEL, at(100.0, 150.0, 170.0), SETTINGS, taps=TAPS)
+    jw, arms = 2j * np.pi * free.frequency[:, None, None], np.outer([1.0, 0.5], [1.0, 0.5])
+    finger, slope = (4e-3 * jw**2 + 1.0 * jw + 200.0) * arms, (1.0 + 2 * jw * 4e-3) * arms
+    loop = replace(free, delay=3, law=free.law + finger, slope=free.slope + slope)
+    poles = loop_poles(loop)
+    poles = poles[(poles.imag > 1.0) & (poles.real > -200.0)]
+    assert len(poles) >= 8
+    here, beside = (abs(loop.difference(np.exp((poles + away) / RATE))) for away in (0.0, 1.0))
+    assert (here < 1e-5 * beside).all()
