@@ -39,14 +39,14 @@ def test_a_replugged_board_goes_on(tmp_path):
 
 
 def test_what_was_recorded_is_complete_and_of_the_board(tmp_path):
-    scene = replace(SCENE, duration=0.6)
+    scene = replace(SCENE, duration=0.2)
     with slow_board(tmp_path) as board:
         driver = SerialDriver(str(board.port), finger=FINGER, clock=SlowClock())
         recording = hr.render(scene, driver=driver)
         time.sleep(0.05)
         log = board.log()
     assert (driver.rate, driver.drive_channels, driver.sensed_channels, driver.delay) == (RATE, 2, 2, 1)
-    assert len(recording) == 3000
+    assert len(recording) == 1000
     assert recording.header.motion_source == "sensors"
     commits = [line for line in log if line[1] == "commit"]
     assert [[float(each) for each in line[3:]] for line in commits] == [pytest.approx([0, 1000, 0, 1e-5, 0], rel=1e-6)]

@@ -119,10 +119,7 @@ def test_a_phase_error_of_the_plant_up_to_the_phase_margin_is_held(sign):
 
 
 def test_unknown_and_known_delay():
-    """400 Hz: 2 unknown samples (58 deg) are held, 3 (86 deg) not, and none matters once it is in the inverse.
-
-    A loop of 5 Hz has a delay margin of 73.6 ms.
-    """
+    """400 Hz: 2 unknown samples (58 deg) are held, 3 (86 deg) not; a loop of 5 Hz has a delay margin of 73.6 ms."""
     for extra, holds in ((2, True), (3, False)):
         error = off("static", 400.0, 6.0, plate=late(1 + extra), known=IDEAL)
         assert error < 2e-3 if holds else error > 2e-2
@@ -166,10 +163,7 @@ def test_saturation_winds_the_polar_loop_up():
     ids=str,
 )
 def test_close_bands(method, spacing, least, most):
-    """Four bands in phase beat into the polar amplitude; independent low passes of 5 Hz are unstable below 8 Hz.
-
-    One innovation for all bands has no beat.
-    """
+    """Four bands in phase beat into the polar amplitude; low passes of 5 Hz are unstable below 8 Hz; h2 has no beat."""
     frequency = 60.0 + spacing * np.arange(4)
     motion = hold(method, fixed(*((f, 1e-5) for f in frequency)), 12.0, IDEAL)[1]
     assert least <= max(abs(amplitude_error(motion, f, 1e-5)[0]) for f in frequency) < most
@@ -234,10 +228,7 @@ def touch(method, frequency, wanted, mechanics, position):
 
 @pytest.mark.parametrize(("frequency", "position"), [(185.0, 0.0), (189.0, 27.5e-3)])
 def test_an_instant_touch_shakes_h_but_not_h2(frequency, position):
-    """40-70 % with H at 185-189 Hz, the finger learnt at 60 /s; H2 <= 13 %.
-
-    Found in 1 ms and off in one sample, learnt at 100 /s: heavy 50-69 %, light 24-46 %.
-    """
+    """With H heavy 50-69 %, light 24-46 %; H2 <= 13 %."""
     for mechanics in (HEAVY, LIGHT_SECOND):
         assert 0.2 < max(touch("h", frequency, 5e-5, mechanics, position)) < 0.90
         assert max(touch("h2", frequency, 5e-5, mechanics, position)) < 0.13
@@ -248,10 +239,7 @@ def test_an_instant_touch_shakes_h_but_not_h2(frequency, position):
 )
 @pytest.mark.parametrize("frequency", [143.0, 189.0])
 def test_h2_lets_a_sudden_release_ring_below_10_um(frequency, wanted, least, most):
-    """24-92 % below ~10 um, 0.8 N: 24-33 % at 10 um, 76-90 at 3 um.  The 18 um of the sag ring out themselves.
-
-    Found: 25-35 % at 10 um, 79-82 % at 3 um; H 117-243 % there.
-    """
+    """24-92 % below 10 um, 0.8 N: 25-35 % at 10 um, 79-82 % at 3 um (H 117-243 %): 18 um of sag ring out."""
     _, release = touch("h2", frequency, wanted, HEAVY, 0.0)
     assert least <= release < most
     if wanted == 3e-6:
@@ -320,10 +308,9 @@ def spur(method, bits_known):
 
 @pytest.mark.parametrize("method", ["h", "h2"])
 def test_rounding_of_the_command(method):
-    """12 bits, 1 um at 20 Hz: harmonics of the stairs meet the mode at 189 Hz.  expected: 0.24-0.31 um, shaped 0.011.
+    """Harmonics of 12-bit stairs meet the mode at 189 Hz: paper 0.40 um, H 0.33, H2 0.24; shaped 0.003.
 
-    Paper 0.40 um, H 0.33, H2 0.24, above the threshold of 0.1 um; noise shaping leaves 0.003.  Rounding is unshaped
-    where the controller is not told of the step.
+    Rounding is unshaped where the controller is not told of the step.
     """
     assert 0.20e-6 < spur(method, False) < 0.45e-6
     assert spur(method, True) < 0.011e-6

@@ -65,8 +65,17 @@ def stopped(recording):
     return recording.drive[:-1]
 
 
+def assert_kept(path, plate):
+    """All that was played is in the journal, and ends with a block of zeros."""
+    played, recording = np.concatenate(plate.played), hr.Recording.load(path)
+    np.testing.assert_array_equal(stopped(recording), played[: -plate.block])  # but for the zeros at the end
+    assert played[: -plate.block].any()
+    assert not played[-plate.block :].any()
+    return recording
+
+
 @pytest.mark.parametrize("block", [1, 25])
-@pytest.mark.parametrize("error", [RuntimeError("the app broke"), KeyboardInterrupt(), MemoryError()])
+@pytest.mark.parametrize("error", [RuntimeError("the app broke"), KeyboardInterrupt()])
 def test_an_exception_in_the_application_ends_in_zero_drive(block, error):
     """The block in hand has been played; the next is zero, as many as it takes to come through."""
     plate = Logged(block=block, told=block, delay=block)
@@ -86,7 +95,7 @@ def scene(frequency=72.0, amplitude=20e-6, duration=1.0, **fields):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
-@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+@pytest.mark.parametrize(("name", "status"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path, name, status):
     """The command line on a device of one's own: what it was played last is zero, and the journal can be read."""
     log, out = tmp_path / "played", tmp_path / "out"
@@ -145,15 +154,12 @@ def test_a_signal_while_the_journal_is_written_loses_nothing(tmp_path):
             raise KeyboardInterrupt
         return 20e-6 * np.cos(2 * np.pi * 72.0 * at)
 
-    plate, texture = Logged(block=25, told=25, delay=25), Own(waveform, bands=make_bands(72.0, 20e-6))
+    plate, texture = logged(""), Own(waveform, bands=make_bands(72.0, 20e-6))
     with pytest.raises(KeyboardInterrupt):
         hr.render(hr.Scene(texture=texture, duration=2.0), driver=plate, journal=tmp_path / "run.au")
     assert [signal.getsignal(each) for each in DEFAULT] == before
     assert _end not in before
-    played = np.concatenate(plate.played)
-    recording = hr.Recording.load(tmp_path / "run.au")
-    np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end
-    assert not played[-25:].any()
+    assert_kept(tmp_path / "run.au", plate)
 
 
 def test_an_exception_in_the_progress_of_a_run_ends_in_zero_drive(tmp_path):
@@ -163,15 +169,10 @@ def test_an_exception_in_the_progress_of_a_run_ends_in_zero_drive(tmp_path):
         if done >= 0.5:
             raise RuntimeError("the app broke")
 
-    plate = Logged(block=25, told=25, delay=25)
+    plate = logged("")
     with pytest.raises(RuntimeError, match="the app broke"):
         hr.render(scene(), driver=plate, journal=tmp_path / "run.au", progress=progress)
-    played = np.concatenate(plate.played)
-    recording = hr.Recording.load(tmp_path / "run.au")
-    assert len(recording) > 0.5 * RATE
-    np.testing.assert_array_equal(stopped(recording), played[:-25])  # but for the zeros at the end
-    assert played[:-25].any()
-    assert not played[-25:].any()
+    assert len(assert_kept(tmp_path / "run.au", plate)) > 0.5 * RATE
 
 
 def test_the_loop_itself_ends_with_zero_drive():

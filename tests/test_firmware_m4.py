@@ -99,19 +99,19 @@ def measured(program):
     return found | {name: [found[name][0] / 1.6] for name in COUNTS}
 
 
-def bank(count):
-    """Scene of `count` ridges that follow the finger: the dearest kind of band."""
-    partials = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(count))
-    texture = hr.Grating(amplitude=20e-6 / (count + 1), wavelength=1e-3, partials=partials)
-    return hr.prepare(hr.Scene(texture=texture, finger=FINGERS["slide"], duration=1.0, keep_unfelt=True))
+@pytest.fixture(scope="module")
+def eight(tmp_path_factory):
+    """Folder, rendering and figures of eight ridges that follow the finger, the dearest bands, under supervision."""
+    partials, folder = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(8)), tmp_path_factory.mktemp("eight")
+    texture = hr.Grating(amplitude=40e-6 / 9, wavelength=1e-3, partials=partials)
+    rendering = hr.prepare(hr.Scene(texture=texture, finger=FINGERS["slide"], duration=1.0, keep_unfelt=True))
+    program = built(folder, rendering, "measure-m4.elf", "OPTIMISE=-O2 -funroll-loops -DSUPERVISED")
+    return folder, rendering, measured(program)
 
 
-def test_eight_bands_leave_a_third_of_a_cortex_m4(tmp_path):
-    """At 168 MHz and 5 kHz a sample has 33 600 cycles, 1.6 of them an instruction at most (benchmarks/board.py).
-
-    Under supervision, as a board plays.
-    """
-    found = measured(built(tmp_path, bank(8), "measure-m4.elf", "OPTIMISE=-O2 -funroll-loops -DSUPERVISED"))
+def test_eight_bands_leave_a_third_of_a_cortex_m4(eight):
+    """At 168 MHz and 5 kHz a sample has 33 600 cycles, 1.6 of them an instruction at most (benchmarks/board.py)."""
+    found = eight[2]
     # the difference of two counts, of which each is that of two readings of a timer of 40 ns: two of 1/1.6
     assert found["nops"][0] == pytest.approx(1000.0, abs=1.26), "instructions are not what is counted"
     assert 1.6 * found["new"][0] < 168e6 / 5000 * 2 / 3
@@ -135,15 +135,14 @@ def test_the_board_fits_into_the_stated_memory(board):
     assert f"{(data + zeroed) / 1e3:.1f} kB of RAM" in (ROOT / "docs" / "firmware.md").read_text(encoding="utf-8")
 
 
-def test_a_cortex_m4_measures_what_is_asked(exports, tmp_path):
+def test_a_cortex_m4_measures_what_is_asked(eight):
     """Telemetry of a band after 0.5 s of a sliding finger, in um, within 2 % of the target and the observer's noise."""
-    rendering = exports.rendering("tones")
-    lines = measured(built(tmp_path, rendering, "measure-m4.elf"))
+    folder, rendering, lines = eight
     _, re_wanted, im_wanted, re_found, im_found = lines["band"]
     wanted, found = complex(re_wanted, im_wanted), complex(re_found, im_found)
     assert abs(wanted) == pytest.approx(abs(rendering.bands.envelope[1]) * 1e6, rel=1e-3)
     assert abs(found - wanted) < 0.02 * abs(wanted) + 3e6 * NOISE
-    (tmp_path / "size.c").write_text(SIZE)
-    program = compile_c(tmp_path / "size", [tmp_path / "size.c"], f"-I{tmp_path}")
+    (folder / "size.c").write_text(SIZE)
+    program = compile_c(folder / "size", [folder / "size.c"], f"-I{folder}")
     size = int(subprocess.run([program], capture_output=True, text=True, check=True).stdout)
     assert 0 <= size - lines["state"][0] <= 8, "more than a shorter pointer"

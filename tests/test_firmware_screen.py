@@ -10,7 +10,6 @@ from board import RATE, SANITISED, SCENE, SLOW, BoardProcess, SlowClock, Stepped
 from laws import KINDS, PARTS
 from test_board_live import wait_for
 from test_firmware_law import CAREFUL
-from test_firmware_m4 import built
 
 import hapticrender as hr
 from hapticrender.bands import Bands, hold_last
@@ -218,10 +217,6 @@ def test_careful_warnings_find_nothing(exports, kind):
     folder = exports.folder / "screen"
     for name in PARTS:
         compile_c(folder / f"{name}.o", [folder / f"{name}.c"], *CAREFUL, "-Wdouble-promotion", KINDS[kind], "-c")
-
-
-def test_it_compiles_for_a_cortex_m4(tmp_path):
-    assert built(tmp_path, hr.prepare(SCREEN), "board-m4.elf").exists()
 
 
 def test_a_profiles_mean_square_reaches_the_board_and_targets_know_no_blocks(program, tmp_path, library):

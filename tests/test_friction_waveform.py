@@ -1,5 +1,7 @@
 """Whole waveforms as friction: recordings, ridges under swipes and turns, of the true friction, without any fit."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 import waves
@@ -30,6 +32,7 @@ DEVICES = {
     "screen, moist and stated": ("electroadhesion", {"gap_resistance": MOIST}, {}),
     "screen, moist and identified": ("electroadhesion", None, {"gap_resistance": MOIST}),
 }
+CASES = [case for case in product(DEVICES, FINGERS) if case[1] == "usual" or "identified" not in case[0]]
 
 
 def white(seconds=2.0, rms=3e-6):
@@ -37,24 +40,18 @@ def white(seconds=2.0, rms=3e-6):
     return hr.Recorded(samples=waves.white(round(seconds * RATE), rms, seed=3), rate=RATE, gain=1.0)
 
 
-def identified(finger, **simulation):
-    """Profile that identification makes of the screen under the finger that slides over it."""
-    with Screen(blind=False, finger=finger, **simulation) as screen:
-        return identify_screen(screen, ElectroadhesionParameters(), finger).profile()
-
-
 def waveform_error(recording):
     return recording.waveform["places"]["friction"]["waveform_error"]
 
 
-@pytest.mark.parametrize("finger", FINGERS)
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize(("device", "finger"), CASES)
 def test_white_noise_is_played_whole(device, finger):
-    kind, profile, simulation = DEVICES[device]
+    (kind, profile, simulation), finger = DEVICES[device], FINGERS[finger]
     if profile is None:
-        profile = identified(FINGERS[finger], **simulation)
+        with Screen(blind=False, finger=finger, **simulation) as screen:
+            profile = identify_screen(screen, ElectroadhesionParameters(), finger).profile()
     fields = {"profile": profile, "simulation": simulation}
-    recording = hr.render(hr.Scene(texture=white(), finger=FINGERS[finger], device=kind, duration=2.0, **fields))
+    recording = hr.render(hr.Scene(texture=white(), finger=finger, device=kind, duration=2.0, **fields))
     assert waveform_error(recording) < MUST
     assert recording.waveform["share_in_band"] > 0.99
     assert not (recording.flags & hr.Flag.SATURATED).any()
@@ -66,28 +63,16 @@ def test_white_noise_is_played_whole(device, finger):
 )
 def test_a_moist_finger_that_nothing_states_fails_the_verdict(texture, finger):
     """Its gain is an eighth of the design's: the bias allows twice the swing, so that no law could play it whole."""
-    scene = hr.Scene(
-        texture=texture,
-        finger=FINGERS[finger],
-        device="electroadhesion",
-        simulation={"gap_resistance": MOIST},
-        duration=1.0,
-        keep_unfelt=True,
-    )
+    fields = {"finger": FINGERS[finger], "simulation": {"gap_resistance": MOIST}, "keep_unfelt": True}
+    scene = hr.Scene(texture=texture, device="electroadhesion", duration=1.0, **fields)
     assert hr.render(scene).summary()["verdict"] == "failed"
 
 
 @pytest.mark.parametrize("area", [0.7, 1.3])
 def test_a_finger_with_another_contact_area_is_learned(area):
     """Within the scene's tolerance after a second; a gain that is 30 % off would be 30 % of the waveform."""
-    scene = hr.Scene(
-        texture=white(),
-        finger=FINGERS["usual"],
-        device="electroadhesion",
-        simulation={"area_scale": area},
-        duration=2.0,
-        settle=1.0,
-    )
+    fields = {"finger": FINGERS["usual"], "simulation": {"area_scale": area}}
+    scene = hr.Scene(texture=white(), device="electroadhesion", duration=2.0, settle=1.0, **fields)
     recording = hr.render(scene)
     assert waveform_error(recording) < scene.tolerance == 0.1
     begin = slice(round(0.1 * recording.rate), round(0.3 * recording.rate))
@@ -135,53 +120,54 @@ class SeenScreen(StrangersScreen):
         return sensed
 
 
-@pytest.mark.parametrize(("mu", "gain"), [(0.6, 1.5e4), (1.0, 1e4)])
-def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(mu, gain):
+STIFF = {"tribometer_frequency": 5000.0, "tribometer_damping": 0.05}
+EARLY = 2 * np.pi * 237 * 159e-6  # of the rms of 237 Hz: with the design's sensor, which is 2 zeta/w_0 = 159 us late
+
+
+@pytest.mark.parametrize(
+    ("mu", "gain", "sensor", "least", "most"),
+    [(0.6, 1.5e4, STIFF, 0.0, MUST), (1.0, 1e4, STIFF, 0.0, MUST), (0.6, 1.5e4, {}, 0.9 * EARLY, 1.1 * EARLY)],
+)
+def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(mu, gain, sensor, least, most):
     """True friction, after half a second, with mu and gain as identified and the sensor as stated: without resonance.
 
-    With the sensor of the design instead, late by 2 zeta/w_0 = 159 us, the friction is early by that: 24 % of the
-    rms of 2 pi 237 Hz, which nobody can see who takes the sensor for what is stated.
+    With the design's sensor the friction is early, which nobody can see who takes the sensor for what is stated.
     """
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.5, span=0.18)
     found = identify_screen(StrangersScreen(mu=mu, gain=gain), ElectroadhesionParameters(), finger).profile()
-    errors = []
-    for sensor in ({"tribometer_frequency": 5000.0, "tribometer_damping": 0.05}, {}):
-        screen = SeenScreen(mu=mu, gain=gain)
-        scene = hr.Scene(texture=white(), finger=finger, device="electroadhesion", duration=1.0, profile=found | sensor)
-        recording = hr.render(scene, driver=screen)
-        band = butter(2, [20.0, 500.0], "bandpass", fs=recording.rate, output="sos")
-        late = slice(round(0.5 * recording.rate), round(0.95 * recording.rate))
-        true, asked = np.array(screen.true)[: len(recording) - 1], recording.reference[1:]
-        true, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
-        errors.append(np.std(true - asked) / np.std(asked))
-    assert errors[0] < MUST
-    assert errors[1] == pytest.approx(2 * np.pi * 237 * 159e-6, rel=0.1)
+    screen = SeenScreen(mu=mu, gain=gain)
+    scene = hr.Scene(texture=white(), finger=finger, device="electroadhesion", duration=1.0, profile=found | sensor)
+    recording = hr.render(scene, driver=screen)
+    band = butter(2, [20.0, 500.0], "bandpass", fs=recording.rate, output="sos")
+    late = slice(round(0.5 * recording.rate), round(0.95 * recording.rate))
+    true, asked = np.array(screen.true)[: len(recording) - 1], recording.reference[1:]
+    true, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
+    assert least <= np.std(true - asked) / np.std(asked) < most
 
 
-@pytest.mark.parametrize("off", [1.0, 1.5])
 @pytest.mark.parametrize(("speed", "rms", "bound"), [(0.01, 0.5e-6, 0.05), (0.1, 3e-6, MUST)])
-def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound, off):
+def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound):
     """True friction is the law's, of the true amplitude; what the recording infers is within a point of it.
 
-    Where the true law's friction is half as large again the recording is the same: it is not judged.
+    Were the true law's friction half as large again, the recording would be the same: it is not judged.
     """
     finger = hr.Finger.sliding(speed=speed, normal_load=0.4, span=0.18)
     device = watched(finger)
-    scene = hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", duration=0.6, settle=0.2)
+    scene = hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", duration=0.45, settle=0.2)
     recording = hr.render(scene, driver=device)
     p, steps = SurfaceParameters(), round(192e3 / recording.rate)
     amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
-    film = off * p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, speed)
+    film = p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, speed)
     kept = np.exp(-speed / 192e3 / p.memory_length)
     true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
     band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
-    late = slice(round(0.2 * recording.rate), round(0.55 * recording.rate))
+    late = slice(round(0.2 * recording.rate), round(0.4 * recording.rate))
     signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
     true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
-    right, shown = (np.std(each - reference) / np.std(reference) for each in (true, inferred))
-    assert shown < bound
-    assert right < bound if off == 1.0 else right > 0.5 - bound
-    assert abs(right - shown) < 0.01 or off > 1.0
+    right, shown, other = (np.std(each - reference) / np.std(reference) for each in (true, inferred, 1.5 * true))
+    assert max(right, shown) < bound
+    assert abs(right - shown) < 0.01
+    assert other > 0.5 - bound
     summary = recording.summary()
     assert summary["verdict"] == "not judged"
     assert "inferred by a law that is assumed" in summary["reason"]
@@ -195,14 +181,14 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(16, 0.8) if tells else None
     device = watched(heavy, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
     recording = hr.render(
-        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.42, settle=0.2), driver=device
+        hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.3, settle=0.2), driver=device
     )
     assert least < friction_of(np.concatenate(device.moved)[:, 0], 200.0, load=0.8) / (10e-3 / 0.64) < most
     assert recording.summary()["verdict"] != "passed"
 
 
-@pytest.mark.parametrize("wavelength", [1e-3, 0.5e-3])
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
+@pytest.mark.parametrize(("wavelength", "sensors"), [(1e-3, ("open", "closed")), (0.5e-3, ("open", "closed", "quiet"))])
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, sensors):
     """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
 
     Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise.  With
@@ -211,21 +197,22 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
     0.4 s/(2 * 0.05 N), 0.4 % for 1 mN; two standard deviations.  A sensor without noise costs nothing.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
-    way = np.sign(np.diff(finger.position(np.arange(11_000) / 10e3)))
+    way = np.sign(np.diff(finger.position(np.arange(8_000) / 10e3)))
     learned = 2 * FRICTION[0] * SlidingParameters().force_noise / (2 * FRICTION_NOISE)
 
     def signed(sample, sensed):
         return sensed._replace(sensed=sensed.sensed * way[sample], motion=None)
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
-    late = slice(5000, 9_500)
-    for name, sensor in {"open": {}, "closed": {"blind": False}, "quiet": {"blind": False, "force_noise": 0.0}}.items():
-        screen = Screen(finger=finger, tell=signed, **sensor)
-        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=1.0)
+    late = slice(3_333, 6_667)  # one swipe
+    for name in sensors:
+        quiet = {"force_noise": 0.0} if name == "quiet" else {}
+        screen = Screen(finger=finger, tell=signed, blind=name == "open", **quiet)
+        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=0.7)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors[name] = np.std(played - asked) / np.std(asked)
     assert max(errors.values()) < 0.02  # what the project has set itself
-    assert errors["quiet"] < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
+    assert errors.get("quiet", 0.0) < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
     assert errors["closed"] < (np.hypot(errors["open"], learned) if wavelength < 1e-3 else errors["open"] + 5e-4)

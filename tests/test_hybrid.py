@@ -102,7 +102,7 @@ def bench(sensed_channels=3, spoil=lambda sample, sensed: sensed):
 
 def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     device = bench()
-    recording = hr.render(scene(tone(100.0), duration=0.8), driver=device)
+    recording = hr.render(replace(scene(tone(100.0), duration=0.6), settle=0.4), driver=device)
     envelope = np.concatenate(device.played)[:, 2]
     assert envelope.max() < 10e-3  # A
     assert envelope[5000:-1].min() > 0.0  # around a bias
@@ -132,7 +132,7 @@ def test_the_plate_of_a_hybrid_is_probed_and_its_screen_without_drive(spoil, nam
     assert 0.01 < abs(drive[:, :2]).max() < 0.05 * 3.0
     assert not drive[:, 2].any()
     assert abs(drive[-1]).max() == 0.0
-    assert hr.prepare(replace(scene(tone(250.0)), rendering={"probe": False}), driver=bench()).probe is None
+    assert hr.prepare(replace(scene(tone(250.0)), rendering={"probe": False}), driver=device).probe is None
 
 
 def test_without_sensors_both_parts_are_driven_open_loop():
@@ -192,11 +192,10 @@ class LateHost:
         return Sensed(sensed, flags=flags)
 
 
-@pytest.mark.parametrize("frequency", [40.0, 60.0])
-def test_a_host_that_is_late_is_not_taken_for_a_fault_of_the_plate(frequency):
+def test_a_host_that_is_late_is_not_taken_for_a_fault_of_the_plate():
     """For 51 ms of every 120, from the first block on; a plate that is inverted is stopped."""
     late = {number for number in range(1250) if 1 <= number % 300 <= 128}
-    texture = tone(frequency, 0.01)
+    texture = tone(40.0, 0.01)
     recording = hr.render(scene(texture, duration=0.5), driver=LateHost(late, (1.0, 1.0, 1.0)))
     assert np.count_nonzero(recording.flags & hr.Flag.OVERRUN) == 4 * len(late)
     with pytest.raises(hr.DeviceFault, match=r"samples until then were lost, .*; found was: "):
@@ -247,20 +246,20 @@ def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
     """A tone of 250 Hz is on the screen alone, and shown 2 zeta/w0 = 159 us late: 25 % of it, where that is left in.
 
     What remains is 0.65 % of the tribometer beside its delay, 0.3 % of the lines between samples, and the noise of a
-    difference of the plate's sensors, 1 um rms each, over 10 000 samples: 0.74 %, five times over.
+    difference of the plate's sensors, 1 um rms each, over 5000 samples: 1.05 %, five times over.
     """
-    plays, driver = replace(scene(tone(250.0), duration=1.5), settle=0.5), bench()
+    plays, driver = replace(scene(tone(250.0), duration=1.0), settle=0.5), bench()
     driver.tell = lambda sample, sensed: Sensed(sensed.sensed, position=sensed.position)  # and where the finger is
     if live:
         with hr.Player(plays, driver, paced=False) as player:
             player.play(plays.texture)
             player.sleep(0.5)
             player.record(tmp_path / "live.au")
-            player.sleep(1.0)
+            player.sleep(0.5)
             recording = player.end_recording()
     else:
         recording = hr.render(plays, driver=driver)
-    rows = slice(len(recording) - 10_000 if not live else 0, len(recording))
+    rows = slice(len(recording) - 5000 if not live else 0, len(recording))
     turn = np.exp(-2j * np.pi * 250.0 * np.arange(len(recording)) / RATE)[rows]
     motion, reference = recording.motion[rows, 0] @ turn, recording.reference[rows] @ turn
-    assert abs(motion / reference - 1.0) < 0.01 + 5 * 0.0074
+    assert abs(motion / reference - 1.0) < 0.01 + 5 * 0.0105

@@ -107,8 +107,7 @@ def random_plate(rng):
 
 LIGHT, HEAVY = {"mechanics": "light", "normal_load": 0.3}, {"mechanics": "heavy", "normal_load": 0.8}
 FREE, RESTING, SLIDING = hr.Finger.absent(), hr.Finger.still(0.015, **HEAVY), hr.Finger.sliding(0.1, **HEAVY)
-ONE, STATIC, SECOND = "one coordinate (heave)", "finger's load only", "finger of 2nd order"
-BENDING = {"bending_frequency": 1250.0}
+ONE, STATIC = "one coordinate (heave)", "finger's load only"
 
 
 def test_random_plates():

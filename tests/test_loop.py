@@ -53,8 +53,8 @@ def equal(one, other, columns=COLUMNS, rounding=0.0):
 
 @pytest.mark.parametrize(
     ("scene", "method"),
-    [(SPATIAL, "paper"), (RECORDED, "paper-common"), (TONE, "paper")],
-    ids=["space", "file", "time"],
+    [(SPATIAL, "paper"), (RECORDED, "paper-common")],
+    ids=["space", "file"],
 )
 def test_compiled_loop_equals_the_ring_of_blocks(scene, method):
     """Sample for sample; the paper's blocks do the same operations, in another order.

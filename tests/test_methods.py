@@ -128,10 +128,7 @@ NOISY, QUIET = PlateParameters(), PlateParameters(sensor_noise=0.0)
 
 @pytest.mark.parametrize(("frequency", "target"), [(20.0, 100e-6), (31.0, 10e-6), (72.0, 10e-6), (400.0, 10e-6)])
 def test_baseline_holds_on_the_free_plate(frequency, target):
-    """<= 0.3 % with noise and <= 0.15 % without, centre and ends, 14-bit sensing and 12-bit command included.
-
-    Averaged over 20 s: the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %.
-    """
+    """Over 20 s the loop follows the noise of the mean, sqrt(2/N) um = 0.045 % of 10 um, 3 sigma < 0.14 %."""
     for plate, bound in ((NOISY, 3e-3), (QUIET, 1.5e-3)):
         motion = hold("paper", fixed((frequency, target)), 21.0, plate)[1]
         error = amplitude(motion, frequency, 20.0) / target - 1.0

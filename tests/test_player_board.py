@@ -1,7 +1,6 @@
 """Live play on a board: a process behind a pseudo-terminal, with a plate in it."""
 
 from contextlib import ExitStack
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from hapticrender.drivers.serial import SerialDriver
 from hapticrender.recordings.recording import Recording
 
 WHITE = hr.Recorded(
-    samples=np.random.default_rng(5).standard_normal(20_000), rate=5000.0, gain=10e-6, passband=(30.0, 300.0)
+    samples=np.random.default_rng(5).standard_normal(20_000), rate=5000.0, gain=10e-6, passband=(30.0, 300.0), speed=0.1
 )
 WANDERING = Own(lambda time, place: 5e-6 * np.sin(2 * np.pi * (60.0 * time + np.nan_to_num(place) / 2e-3)))  # m
 
@@ -45,7 +44,7 @@ def test_a_board_plays_live(program, tmp_path):
         with hr.Player(driver=driver) as player:
             player.play(TONE)
             player.record(tmp_path / "board.au")
-            player.sleep(0.5)
+            player.sleep(0.3)
             [tone] = player.state().bands
             player.play(hr.Grating(frequency=150.0, amplitude=4e-6))
             player.gain = 0.5
@@ -53,18 +52,16 @@ def test_a_board_plays_live(program, tmp_path):
             [other] = player.state().bands
             recording = player.end_recording()
             player.gain = 1.0
-            player.play(WHITE)
-            player.record(tmp_path / "white.au")
-            player.sleep(0.5)
+            player.play(WHITE + 0.5 * hr.Chirp(start=50.0, stop=90.0, duration=1.0, amplitude=4e-6))
+            player.record(tmp_path / "both.au")
+            slide(player, driver.client.clock, 0.5, -0.03, 0.1)
             [white] = player.state().bands
-            player.play(replace(WHITE, speed=0.1) + 0.5 * hr.Chirp(start=50.0, stop=90.0, duration=1.0, amplitude=4e-6))
-            slide(player, driver.client.clock, 0.6, -0.03, 0.1)
             assert player.state().flags == hr.Flag(0)
             both = player.end_recording()
             player.play(hr.Grating(wavelength=1e-3, amplitude=4e-6))
-            slide(player, driver.client.clock, 0.5, 0.03, -0.1)
+            slide(player, driver.client.clock, 0.4, 0.03, -0.1)
             [ridges] = player.state().bands
-            player.finger(-0.02, 0.0, 0.4)
+            player.finger(-0.01, 0.0, 0.4)
             player.sleep(0.5)
             [resting] = player.state().bands
     assert ridges.frequency == pytest.approx(100.0, rel=0.1)  # a correction of 2 mm is 8 % of a quarter of a second
@@ -91,11 +88,11 @@ def test_a_board_plays_a_texture_in_time_and_place_at_once(program, tmp_path):
             player.sleep(0.2)
             player.play(WANDERING)
             player.record(tmp_path / "wandering.au")
-            slide(player, driver.client.clock, 0.8, -0.03, 0.05)
+            slide(player, driver.client.clock, 0.6, -0.03, 0.05)
             assert player.state().flags == hr.Flag(0)
             found = player.end_recording()
             player.play(TONE)
-            player.sleep(0.2)
+            player.sleep(0.15)
             [tone] = player.state().bands
     assert tone.target == pytest.approx(5e-6, rel=1e-3)
     last = slice(-1500, None)
@@ -117,12 +114,12 @@ def test_a_board_that_is_found_again_is_recorded_again(program, tmp_path):
         with hr.Player(driver=driver) as player:
             player.play(TONE)
             player.record(tmp_path / "board.au")
-            player.sleep(0.5)
+            player.sleep(0.3)
             before = player.time
             board.kill()
             boards.enter_context(BoardProcess(program, tmp_path, *SLOW))
-            player.sleep(0.6)
-            assert round((player.time - before) * driver.rate) >= 3000  # 0.6 s of samples
+            player.sleep(0.5)
+            assert round((player.time - before) * driver.rate) >= 2500  # 0.5 s of samples
             assert player.state().flags & hr.Flag.OVERRUN
             recording = player.end_recording()
     parts = [phasor(each[-1500:], 100.0) for each in (recording.reference, recording.motion[:, 0])]
@@ -132,7 +129,7 @@ def test_a_board_that_is_found_again_is_recorded_again(program, tmp_path):
 def unplug(board, player, path):
     player.play(TONE)
     player.record(path)
-    player.sleep(0.3)
+    player.sleep(0.15)
     board.kill()
     player.sleep(10.0)
 
@@ -156,7 +153,7 @@ def test_the_board_stops_when_the_application_is_silent(program, tmp_path):
         driver = SerialDriver(str(board.port), clock=SlowClock())
         with hr.Player(driver=driver, watchdog=0.1) as player:
             player.play(TONE)
-            player.sleep(0.2)
+            player.sleep(0.05)
             assert player.state().flags == hr.Flag(0)
             driver.client.clock.sleep(0.3)
             with pytest.raises(hr.WatchdogTimeout, match="no method of the player was called"):

@@ -1,7 +1,6 @@
-"""Live play: playlists, and textures of one's own, in time and place at once too."""
+"""Live play, not paced: playlists, and textures of one's own, in time and place at once too."""
 
 import threading
-import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,6 @@ import pytest
 from live_devices import RIDGES, TONE, Lying, error_of, slide
 
 import hapticrender as hr
-from hapticrender import sampled_texture
 
 
 def test_a_playlist_along_the_surface_goes_round():
@@ -40,7 +38,7 @@ UNPLAYABLE = [
 @pytest.mark.parametrize("first", [True, False])
 def test_a_playlist_that_cannot_be_played_leaves_what_plays_and_a_device_that_can(first):
     """Its second part is refused before anything plays, and before there are threads to wait for."""
-    with hr.Player(paced=first) as player:
+    with hr.Player(paced=False) as player:
         if not first:
             player.play(TONE)
         for parts, message in UNPLAYABLE:
@@ -182,25 +180,3 @@ def test_a_playlist_along_the_surface_plays_beside_a_tone_and_within_another():
             (row,) = player.state().bands
             assert row.target > 0.9 * 5e-6 / np.sqrt(2)
             assert row.error < WORST
-
-
-def test_what_plays_goes_on_while_a_texture_is_prepared(tmp_path, monkeypatch):
-    """The samples ahead last 0.2 s, the next texture takes longer: none is lost, and the watchdog waits."""
-    monkeypatch.setattr(sampled_texture, "AHEAD", 0.2)
-    ready = threading.Event()
-    with hr.Player(watchdog=0.3) as player:
-        player.play(Own(in_time=100.0))
-        player.sleep(0.5)
-        player.record(tmp_path / "long.au")
-        began = player.time
-        change = threading.Thread(target=player.play, args=(Own(in_time=150.0, ready=ready),))
-        change.start()
-        while player.time < began + 1.0:
-            time.sleep(0.01)  # the application waits in `play`
-        ready.set()
-        change.join(60.0)
-        player.sleep(0.2)
-        recording = player.end_recording()
-    assert np.isfinite(recording.motion).all()  # as of samples that were not kept; a busy machine may flag some as late
-    meanwhile = recording.reference[500:4500]  # 0.1 to 0.9 s
-    assert min(np.std(meanwhile[i : i + 500]) for i in range(0, 4000, 500)) > 0.9 * 5e-6 / np.sqrt(2)

@@ -200,7 +200,7 @@ def test_a_gain_of_three_is_refused_on_a_free_surface_and_a_scene_may_leave_the_
 def friction_of(moved, frequency, rate=192e3, load=0.4):
     """Friction (N) under a load (N) that an amplitude leaves, at a frequency, behind the lag of its contact."""
     amplitude = abs(hilbert(moved))
-    late = slice(round(0.3 * rate), round(0.4 * rate))
+    late = slice(round(0.18 * rate), round(0.28 * rate))
     friction = 0.8 * load * SurfaceParameters().friction_law.ratio(amplitude[late], load, 0.08)
     return abs(phasor(friction, frequency, rate) * SurfaceParameters().lag_response(frequency, 0.08))
 
@@ -208,7 +208,7 @@ def friction_of(moved, frequency, rate=192e3, load=0.4):
 def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
     """A per cent in friction, with the lock on although it takes blocks."""
     device = watched()
-    session = prepare(scene(frequency=200.0, duration=0.42, settle=0.2), driver=device)
+    session = prepare(scene(frequency=200.0, duration=0.3, settle=0.2), driver=device)
     recording = run(session)
     assert friction_of(np.concatenate(device.moved)[:, 0], 200.0) == pytest.approx(WANTED, rel=PER_CENT)
     assert (session.driver.block, session.driver.delay) == (1, 1)
@@ -221,7 +221,7 @@ def test_a_device_of_a_friction_sample_a_block_renders_a_tone():
 def test_a_file_at_192_khz_is_driven_open_loop(tmp_path):
     """What the file holds vibrates the plate of which all is known as it should; the law leaves out W/2w."""
     file = WaveFileDriver(tmp_path / "drive.wav", rate=192e3, drive_channels=1, full_scale=10.0)
-    recording = hr.render(scene(frequency=200.0, duration=0.42, settle=0.2), driver=file)
+    recording = hr.render(scene(frequency=200.0, duration=0.3, settle=0.2), driver=file)
     assert recording.rate == 12e3
     assert recording.sensed.shape[1] == 0
     drive = read_back(file.path, full_scale=file.full_scale)
@@ -229,7 +229,7 @@ def test_a_file_at_192_khz_is_driven_open_loop(tmp_path):
     assert friction_of(moved, 200.0) == pytest.approx(WANTED, rel=PER_CENT)
     # naive: a finger of twice the load is not noticed; its film has other friction, and the plate another resonance
     heavy = UltrasonicPlate(UltrasonicParameters(), hr.Finger.sliding(speed=0.08, normal_load=1.5)).run(drive)
-    assert abs(hilbert(heavy.motion[:, 0]))[60000:70000].mean() < 0.8 * abs(hilbert(moved))[60000:70000].mean()
+    assert abs(hilbert(heavy.motion[:, 0]))[35000:45000].mean() < 0.8 * abs(hilbert(moved))[35000:45000].mean()
 
 
 BOUND = 0.02  # of the amplitude, under touch and lift
