@@ -155,7 +155,7 @@ class Resonant:
                 )
             if each * late > MOST_INTEGRAL:
                 bound = f"must be <= {MOST_INTEGRAL / late:.3g} 1/s a band behind a delay of {late:.3g} s"
-                raise DesignError(f"too small a margin: gain={each:g} 1/s {bound}: lower gain={self.gain:g} or the delay")
+                raise DesignError(f"too small a margin: gain={each:g} 1/s {bound}: lower it, or the delay")
         settings = complex_settings(model, bands, model.lowest_frequency / 4, False, feedback)
         half = 0.5 * each * period
         settings |= {"low_pass": ALL_PASS, "loop": (half, half, 0.0, -1.0, 0.0)}

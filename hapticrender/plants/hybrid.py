@@ -78,8 +78,8 @@ class HybridPlant(CompiledPlant):
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
     senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
     plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
-    the skin velocity that matches a newton of friction, > 0.  A ValueError where plate and screen differ in rate, delay
-    or finger, or the plate has a single coil.
+    the skin velocity that matches a newton of friction.  The plate has two coils; both parts have one rate, a delay of
+    a sample and one finger, as is checked where a scene is read.
     """
 
     step = hybrid_step
@@ -87,16 +87,6 @@ class HybridPlant(CompiledPlant):
     motion_channels = 3
 
     def __init__(self, plate: Plate, screen: CompiledPlant, velocity_per_force: float) -> None:
-        for name, found, needed in (
-            ("rate", plate.rate, screen.rate),
-            ("delay", plate.delay, screen.delay),
-            ("finger", plate.finger, screen.finger),
-            ("coils", plate.drive_channels, COILS),
-        ):
-            if found != needed:
-                raise ValueError(f"plate.{name} = {found}: must be {needed} with this screen")
-        if not velocity_per_force > 0.0:
-            raise ValueError(f"{velocity_per_force=}: must be > 0 m/(N s)")
         super().__init__(screen.finger, screen.rate)
         self.plate, self.screen = plate, screen
         self.noise_channels = plate.noise_channels + screen.noise_channels

@@ -47,7 +47,7 @@ from hapticrender.touch.finger import Finger
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
 UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
 RAMP = 0.05  # s: fade-in and fade-out of the drive
-LEAST_WAIT = 0.25  # s: least time from the first motion to the record
+WAIT, LEAST_WAIT = 0.3, 0.25  # s, from the first drive to the record; from the first motion, behind a long delay
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
@@ -172,10 +172,7 @@ def identify(
     parameters: PlateParameters,
     *,
     seconds: float = 1.0,
-    wait: float = 0.3,
     amplitude: float = 100e-6,
-    contact: float = CONTACT,
-    unexplained: float = UNEXPLAINED,
 ) -> Identified:
     """Identify the free plate behind a driver from the response to a multi-sine.
 
@@ -188,15 +185,11 @@ def identify(
     parameters : PlateParameters
         Expected plate; electronics, geometry, the mean of the sensor gains and the modal mass of a bending mode, which
         only scales its shape at the coils, are taken as given.
-    seconds, wait : float, s
-        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s,
-        longer where the driver's delay is above 0.05 s: delays up to wait - 0.05 s are identified.
+    seconds : float, s
+        Length of the record, enough to resolve the narrowest mode.  It begins 0.3 s after the first drive, later where
+        the driver's delay is above 0.05 s: delays of 0.25 s are identified, and of 0.2 s beyond that stated.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate; less where the driver's `drive_limit` allows less.
-    contact : float, N, > 0
-        Bound of the static load.
-    unexplained : float, > 0
-        Bound of the share of the motion that the model leaves unexplained.
 
     Raises
     ------
@@ -220,15 +213,14 @@ def identify(
     Errors of the model show in `misfit`: a command of 10 bits taken for 12 leaves 1 % of the motion.
     """
     if isinstance(driver, str):
-        options = {"wait": wait, "amplitude": amplitude, "contact": contact, "unexplained": unexplained}
         made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
         made = made.driven_by_host() if hasattr(made, "driven_by_host") else made
         with stopped_by_signal(), naming_driver(driver), made as opened:
-            found = identify(opened, parameters, seconds=seconds, **options)
+            found = identify(opened, parameters, seconds=seconds, amplitude=amplitude)
         return found.shortened(getattr(made, "host_delay", 0))
     rate = float(driver.rate)
-    samples = _samples(driver, parameters, seconds, wait)
-    wait = max(wait, driver.delay / rate + LEAST_WAIT)
+    samples = _samples(driver, parameters, seconds)
+    wait = max(WAIT, driver.delay / rate + LEAST_WAIT)
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
     if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
@@ -248,7 +240,7 @@ def identify(
     except np.linalg.LinAlgError as error:
         raise DesignError(f"{seconds=:g} s: does not determine all parameters; lengthen the record") from error
     found = _identified(fit, record, driver)
-    _check_free(found, record, contact, unexplained)
+    _check_free(found, record)
     return found
 
 
@@ -264,15 +256,14 @@ def _with_bending(rigid: Fit, record: Record) -> Fit | None:
     return fit if clear > CLEAREST else None
 
 
-def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
+def _samples(driver: Driver, parameters: PlateParameters, seconds: float) -> int:
     """Check the arguments and return the length of the record in samples."""
     check_driver(driver)
     check_channels(driver, {2: "both coils, to identify a plate"}, {2: "a displacement sensor at each end of it"})
     for name in ("coils", "degrees_of_freedom"):
         found = getattr(parameters, name)
         require(found == 2, name, found, "2 to identify heave and rocking")
-    for name, value, least in (("seconds", seconds, 0.0), ("wait", wait, 2 * RAMP)):
-        require(math.isfinite(value) and value >= least, name, value, f">= {least:g} s")
+    require(0.0 <= seconds < math.inf, "seconds", seconds, ">= 0 s")
     return round(seconds * driver.rate)
 
 
@@ -377,16 +368,16 @@ def _identified(fit: Fit, record: Record, driver: Driver) -> Identified:
     )
 
 
-def _check_free(found: Identified, record: Record, contact: float, unexplained: float) -> None:
+def _check_free(found: Identified, record: Record) -> None:
     """Refuse a plate with a static load, and motion that the model does not explain."""
-    if not abs(found.load) <= contact:
+    if not abs(found.load) <= CONTACT:
         raise DesignError(
-            f"static load = {found.load:.3g} N: must be within +-{contact:g} N; remove the finger, or zero the sensors"
+            f"static load = {found.load:.3g} N: must be within +-{CONTACT:g} N; remove the finger, or zero the sensors"
         )
     lines = record.sensed[record.lines]
     share = found.residual / math.sqrt((abs(lines) ** 2).mean() * len(lines) / 2)
-    if not (found.explained or share <= unexplained):
+    if not (found.explained or share <= UNEXPLAINED):
         raise DesignError(
-            f"unexplained motion = {100 * share:.3g} %: must be <= {100 * unexplained:g} %; remove the finger; if none "
+            f"unexplained motion = {100 * share:.3g} %: must be <= {100 * UNEXPLAINED:g} %; remove the finger; if none "
             "touches, geometry or force constant in [device] do not match the plate"
         )
