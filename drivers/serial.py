@@ -44,18 +44,14 @@ class SerialDriver(BaseDriver):
         Name of the serial port.
     finger : object with ``position(time)`` (m, NaN: lifted) and ``load(time)`` (N), optional
         Such as ``hapticrender.Finger``, from the start of the run on; `render` sets it to the scene's unless given.
-    block : int, >= 1
-        1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
-        from a block acts two blocks later.
     **options
         Of `BoardClient`.
     """
 
     device_kind: str  # of which the firmware has the law
-    play_delay: int  # samples, of a copy that plays the drive of the host
 
-    def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
-        self.client, self.options = BoardClient(port, **options), options
+    def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
+        self.client = BoardClient(port, **options)
         self.finger, self._sent, self._begun, self._last = finger, 0, False, np.full(1, np.nan)
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
@@ -66,30 +62,18 @@ class SerialDriver(BaseDriver):
             rate=found.rate,
             drive_channels=found.drive_channels,
             sensed_channels=found.sensed_channels,
-            block=block,
-            delay=found.delay + (2 * block if block > 1 else 0),
+            delay=found.delay,
         )
-
-    def driven_by_host(self) -> "SerialDriver":
-        """Return the same board as a device that plays the drive of the host, for identification."""
-        return self if self.block > 1 else SerialDriver(self.client.port, block=HOST_BLOCK, **self.options)
 
     @contextmanager
     def by_host(self) -> Iterator["SerialDriver"]:
-        """Let the open board play the drive of the host, and leave it at rest."""
+        """Let the open board play the drive of the host, which acts two blocks later, and leave it at rest."""
         board = copy(self)
-        if self.block == 1:
-            board.block = HOST_BLOCK
-            board.play_delay = self.delay + 2 * HOST_BLOCK
+        board.block, board.delay = HOST_BLOCK, self.delay + 2 * HOST_BLOCK
         try:
             yield board
         finally:
             self.client.stop()
-
-    @property
-    def host_delay(self) -> int:
-        """Samples of `delay` that the loop on the board itself does not have."""
-        return self.delay - int(self.capabilities.delay)
 
     @classmethod
     def found(cls) -> list[str]:
@@ -104,8 +88,8 @@ class SerialDriver(BaseDriver):
             return f"no board answers ({type(error).__name__})"
         return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
 
-    def device_loop(self, controller: Controller) -> DeviceLoop | None:
-        """Return the board's own loop, with the scene's texture; None for a block device.
+    def device_loop(self, controller: Controller) -> DeviceLoop:
+        """Return the board's own loop, with the scene's texture.
 
         Raises
         ------
@@ -114,8 +98,6 @@ class SerialDriver(BaseDriver):
         ValueError
             The board cannot play this texture, see `playable`.
         """
-        if self.block != 1:
-            return None
         inner: Any = getattr(controller, "controller", controller)
         rendering = self.rendering
         if rendering is None or inner.method != "inverse":
@@ -194,7 +176,7 @@ class SerialDriver(BaseDriver):
         """Queue a block on the board, one block ahead of what it plays, and return what was sensed in the block."""
         client = self.client
         if self.block == 1:
-            raise DriverError(f"{self}: play: the loop runs on the board; for drive from the host set block > 1")
+            raise DriverError(f"{self}: play: the loop runs on the board; for drive from the host use by_host()")
         if not self._begun:
             self._begun = True
             client.begin_queue()

@@ -1,12 +1,8 @@
 """Hybrid: low bands on a vibrotactile plate, high bands by the friction of an electroadhesion screen on it.
 
 The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  The
-shares of both sum to one at every frequency: the screen's is
-
-    s(f) = e(f/F - 1),   e(x) = x^2 (3 - 2 x) from 0 to 1,
-
-0 below F and 1 above 2 F, half at the crossover 1.5 F, and the plate's is 1 - s.  Of carriers that follow the finger
-each bank takes its share while the frequency goes up and down, by the fades that end its range.
+shares of both sum to one at every frequency (docs/theory.md, "Hybrid").  Of carriers that follow the finger each bank
+takes its share while the frequency goes up and down, by the fades that end its range.
 """
 
 import math

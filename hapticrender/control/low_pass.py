@@ -1,15 +1,10 @@
 """The step of the methods that estimate by a low pass: polar loops, and complex loops with the free device's inverse.
 
 With a carrier e^(j phi) and y a coordinate, a band's envelope is X = L[2 y e^(-j phi)], L a second-order low pass or
-the mean over a window; C is the loop controller, R the reference envelope (docs/theory.md, "Loop shaping of the
-paper"; Grigorii et al. 2021, eqs. 1-5).  Polar, with s = +-1 the sign of the carrier's frequency and g, theta_D gain
-and phase of the free device from a table over frequency::
-
-    A = max(C[|R| - |X|], 0),   theta = -C[s arg(X conj R)],   u = sum A/g cos(phi + arg R + s theta)
-
-so that a carrier that runs backwards is followed as its mirror image.  Without feedback A = |R| and theta makes up for
-theta_D, delay and hold.  Complex: V = C[shape R - X], or V = shape R + C[-X] of the deviation from the reference, and
-F = rho D(jw) V, or rho (D V + D' dV/dt + j dw/dt M V), of the free device; see `laws` for rho.
+the mean over a window; C is the loop controller, R the reference envelope.  The laws are those of docs/theory.md, "Loop
+shaping of the paper" (Grigorii et al. 2021, eqs. 1-5).  In the polar one the sign of a carrier's frequency turns the
+phase, so that a carrier that runs backwards is followed as its mirror image; without feedback the amplitude is |R| and
+the phase makes up for that of the device, delay and hold.  The complex ones hand V to `laws`, static without D'.
 """
 
 import math

@@ -135,8 +135,7 @@ class Resonant:
     -----
     From motion to force an integrator is ``-ki [D(jw)/(s - jw) + D'(jw) + conj. at -jw]``.  At a mode w1 of mass m and
     stiffness m w1^2 that is ``+j w1 2 ki m``: negative damping of 2 ki m from every band.  All together must stay below
-    the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate: 16.1 1/s for the rocking of the paper's plate.
-    Delay and hold leave 3 % more for low carriers and take the limit away for those above the modes.
+    the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate.
     """
 
     gain: float = 15.0  # 1/s, sum of ki over the bands, > 0, below the decay rate of the least damped mode

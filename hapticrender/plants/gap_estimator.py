@@ -1,11 +1,9 @@
 """Estimate the attraction on an electroadhesive finger from the impedance of its gap at the carrier.
 
-The equations are those of docs/theory.md, "Gap estimation" (Shultz, Peshkin, Colgate 2018), on the complex envelopes of
-voltage and current, low-passed by the STDFT*.  The force follows |I|^2 at once; only the impedance is averaged over a
-longer time, weighted by power, so that an envelope may pass through zero.  The force cannot be estimated while the
-finger is away or rests, before it has rested once, or when its gap leaks so much that L falls below a bound.  The
-output is then F = g |I|^2, what a control loop expects of a nominal finger, so that no integrator winds up, and
-`Flag.OPEN_LOOP` is raised.
+The equations are those of docs/theory.md, "Gap estimation" (Shultz, Peshkin, Colgate 2018).  The force follows |I|^2
+at once; only the impedance is averaged over a longer time, weighted by power, so that an envelope may pass through
+zero.  While the finger is away or rests, before it has rested once, or when its gap leaks too much, the output is
+F = g |I|^2, as of a nominal finger, so that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
 """
 
 from __future__ import annotations

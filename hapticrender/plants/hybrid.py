@@ -1,12 +1,9 @@
 """A screen laminated on a plate: the plate moves the finger, the screen rubs it, and both add to one skin velocity.
 
-Velocities that feel alike add in phase, with v/F = 0.64 m/(N s) (docs/theory.md, "Hybrid"; Grigorii et al. 2021)::
-
-    v = d/dt (displacement of the glass under the finger) + (v/F) (friction)
-
-The plate carries the finger's load alone, as attraction presses skin and glass on each other as much as it pulls;
-friction acts along the plate and does not move it.  Left out are the motion of the gap, and what the plate's vibration
-makes of friction: the match v/F was measured by fingers that slid over a vibrating plate.
+Velocities that feel alike add in phase (docs/theory.md, "Hybrid").  The plate carries the finger's load alone, as
+attraction presses skin and glass on each other as much as it pulls; friction acts along the plate and does not move it.
+Left out are the motion of the gap, and what the plate's vibration makes of friction: the match v/F was measured by
+fingers that slid over a vibrating plate.
 """
 
 from typing import Any

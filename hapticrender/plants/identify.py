@@ -9,7 +9,7 @@ damped, since the force is known through the drive alone.  Every control law sca
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -203,21 +203,22 @@ def identify(
 
     Notes
     -----
-    With 1 um of noise at 5 kHz, 1 s of 100 um gives m, I and k to 0.05 %, b to 0.25 %, the delay to 0.002 samples
-    and the gain difference to 0.001 (95 % intervals); they shrink as 1/amplitude and as 1/sqrt(seconds).
-
-    A symmetric bending mode below 2.2 kHz (0.44 times the rate) is found from a shape at the coils of about 0.003 on;
-    what lies below 5 standard deviations is taken for none.  0.1 at 1250 Hz and Q 30 is clear by 240 of them: its
-    frequency comes within 0.3 Hz, its damping and shape at the coils within 1 %.
-
+    Intervals shrink as 1/amplitude and as 1/sqrt(seconds).  A symmetric bending mode below 2.2 kHz (0.44 times the
+    rate) is found from a shape at the coils of about 0.003 on; what lies below 5 standard deviations is taken for none.
     Errors of the model show in `misfit`: a command of 10 bits taken for 12 leaves 1 % of the motion.
     """
     if isinstance(driver, str):
         made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
-        made = made.driven_by_host() if hasattr(made, "driven_by_host") else made
         with stopped_by_signal(), naming_driver(driver), made as opened:
             found = identify(opened, parameters, seconds=seconds, amplitude=amplitude)
         return found.shortened(getattr(made, "host_delay", 0))
+    with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
+        found = _fitted(player, parameters, seconds, amplitude)
+    return found.shortened(player.delay - driver.delay)
+
+
+def _fitted(driver: Driver, parameters: PlateParameters, seconds: float, amplitude: float) -> Identified:
+    """As `identify`, by the open driver's `play`."""
     rate = float(driver.rate)
     samples = _samples(driver, parameters, seconds)
     wait = max(WAIT, driver.delay / rate + LEAST_WAIT)
