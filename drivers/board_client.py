@@ -289,14 +289,8 @@ class BoardClient(OpenedInWith):
     def telemetry(self) -> Telemetry:
         """Return the latest telemetry; wait for the first.
 
-        Raises
-        ------
-        DeviceLost
-            The line or the board is gone, and did not come back within `reconnect`.
-        DeviceFault
-            The board stopped by itself: the drive, or a sensor.
-        WatchdogTimeout
-            The board stopped as the application was silent, see `watch`.
+        A `DeviceLost` where line or board are gone and did not come back within `reconnect`, a `DeviceFault` where the
+        board stopped by itself, a `WatchdogTimeout` where it stopped as the application was silent (`watch`).
         """
 
         def wait(line: BoardLine) -> Telemetry:

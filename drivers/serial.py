@@ -91,12 +91,7 @@ class SerialDriver(BaseDriver):
     def device_loop(self, controller: Controller) -> DeviceLoop:
         """Return the board's own loop, with the scene's texture.
 
-        Raises
-        ------
-        DriverError
-            The board cannot play this: it has the law of method "inverse".
-        ValueError
-            The board cannot play this texture, see `playable`.
+        A `DriverError` where the method is not that of the board's law; a ValueError where it cannot play the texture.
         """
         inner: Any = getattr(controller, "controller", controller)
         rendering = self.rendering
