@@ -214,9 +214,9 @@ def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):
     other = dataclasses.replace(PAPER, mass=PAPER.mass / 0.95, stiffness_1=PAPER.stiffness_1 / 1.05)
     assert one.differences(PAPER) == ()
     near = dataclasses.replace(PAPER, stiffness_1=PAPER.stiffness_1 / 1.005)
-    assert [each.name for each in one.differences(near)] == ["stiffness_1"]
-    assert [each.name for each in one.differences(other)] == ["mass", "stiffness_1"]
-    text = "; ".join(map(str, one.differences(other)))
+    assert [each.split()[0] for each in one.differences(near)] == ["stiffness_1"]
+    assert [each.split()[0] for each in one.differences(other)] == ["mass", "stiffness_1"]
+    text = "; ".join(one.differences(other))
     assert re.match(r"mass -[45]\.\d\d \+- 0\.0\d %; stiffness_1 \+[45]\.\d\d", text)
 
 
@@ -224,7 +224,7 @@ def test_a_delay_that_the_driver_does_not_state_is_found():
     identified = found(delay=2)
     assert identified.estimates["delay"].value == pytest.approx(2, abs=0.01)
     assert "driver.delay = 1 samples: measured 2.00, set it to 2" in identified.text()
-    assert re.fullmatch(r"delay \+1.00\d\d \+- 0.00\d\d samples", str(identified.differences(PAPER)[0]))
+    assert re.fullmatch(r"delay \+1.00\d\d \+- 0.00\d\d samples", identified.differences(PAPER)[0])
 
 
 def test_a_delay_longer_than_the_wait_is_found():

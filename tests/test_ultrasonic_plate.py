@@ -102,7 +102,7 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     """Images past the 300th hold less than 2 f^2 F/(300^2 rate^3) < 4e-9 of it, with F the offset or the pole."""
     parameters = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
     if level == "envelope":
-        parameters = parameters.transposed(6e3, 48e3)
+        parameters = parameters.sampled(48e3, "envelope")
     frequency = parameters.carrier + offset
     expected = sum(held(parameters, frequency, load))
     assert abs(respond(parameters, frequency, finger) / expected - 1) < 2 * SETTLED + 4e-9
@@ -113,7 +113,7 @@ def test_runs_of_carrier_and_envelope_differ_by_the_envelope_error(finger, load,
     """Each divided by its own hold; the images, which each rate has its own of, are all that is left."""
     carrier = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
     gain, left = [], 2 * SETTLED
-    for parameters in (carrier, carrier.transposed(6e3, 48e3)):
+    for parameters in (carrier, carrier.sampled(48e3, "envelope")):
         frequency = parameters.carrier + offset
         base, images = held(parameters, frequency, load)
         turns = frequency / parameters.rate

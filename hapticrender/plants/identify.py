@@ -19,7 +19,7 @@ import numpy as np
 from hapticrender.checks import require
 from hapticrender.devices import naming_driver, open_driver, registered
 from hapticrender.driver_checks import check_channels, check_driver, check_sensed
-from hapticrender.errors import DesignError
+from hapticrender.errors import DesignError, noted_on
 from hapticrender.plants.fitting import (
     BENDING,
     CLEAREST,
@@ -65,22 +65,6 @@ class Estimate(NamedTuple):
 
     value: float
     interval: float
-
-
-class Difference(NamedTuple):
-    """A significant difference; `interval` is the half-width of its 95 % interval."""
-
-    name: str
-    found: float
-    designed: float
-    interval: float
-
-    def __str__(self) -> str:
-        change = self.found - self.designed
-        if self.name in (*MECHANICAL, *BENDING) and self.designed:
-            relative = 100 / self.designed
-            return f"{self.name} {change * relative:+.2f} +- {abs(self.interval * relative):.2f} %"
-        return f"{self.name} {change:+.4f} +- {self.interval:.4f} {UNITS[self.name]}".rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,15 +140,19 @@ class Identified:
         coil = self.estimates.get("bending_coil", Estimate(0.0, 1.0))
         return abs(coil.value) / coil.interval * SIGMAS_95
 
-    def differences(self, designed: PlateParameters) -> tuple[Difference, ...]:
-        """Return the estimates that differ from `designed` by more than twice their interval."""
-        expected = {name: getattr(designed, name) for name in (*MECHANICAL, "delay", *BENDING)}
+    def differences(self, designed: PlateParameters) -> tuple[str, ...]:
+        """State every estimate that differs from `designed` by more than twice its interval, and by how much."""
+        expected = {name: float(getattr(designed, name)) for name in (*MECHANICAL, "delay", *BENDING)}
         expected["gain_difference"] = sensor_gains(designed)[1]
-        return tuple(
-            Difference(name, estimate.value, float(expected[name]), estimate.interval)
-            for name, estimate in self.estimates.items()
-            if abs(estimate.value - expected[name]) > SIGNIFICANT * estimate.interval
-        )
+        found = []
+        for name, (value, interval) in self.estimates.items():
+            change, known = value - expected[name], expected[name]
+            if abs(change) > SIGNIFICANT * interval:
+                share = known != 0.0 and name in (*MECHANICAL, *BENDING)
+                scale, digits, unit = (100.0 / known, 2, "%") if share else (1.0, 4, UNITS[name])
+                text = f"{name} {change * scale:+.{digits}f} +- {abs(interval * scale):.{digits}f} {unit}"
+                found.append(text.rstrip())
+        return tuple(found)
 
 
 def identify(
@@ -313,10 +301,8 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
-        try:
+        with noted_on(error, "sending zero drive"):
             driver.play(np.zeros_like(padded[:block]))
-        except Exception as late:
-            error.add_note(f"and while sending zero drive: {late}")
         raise
     columns: Any = [None if each[0] is None else np.concatenate(each)[:n] for each in zip(*kept, strict=True)]
     return Sensed(*columns)
