@@ -180,10 +180,7 @@ class BoardClient(OpenedInWith):
         texture fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took
         the bands.
 
-        Raises
-        ------
-        ValueError
-            The targets are no constant envelopes, there are too many bands, or the board refuses a number.
+        A ValueError where the targets are no constant envelopes, there are too many bands, or it refuses a number.
         """
         most = self.capabilities.bands
         if bands.envelope is None and (texture is None or len(bands)):
@@ -256,12 +253,8 @@ class BoardClient(OpenedInWith):
     def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
         """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
 
-        Parameters
-        ----------
-        stream : int
-            Samples between two rows that the board streams back; 0: none.
-        telemetry : float, s
-            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+        It streams a row back every `stream` samples, 0: none, and telemetry every `telemetry` s, 0.2 ms to 13 s at
+        5 kHz.
         """
         period = round(telemetry * self.capabilities.rate)
         start = integer("stream", stream, "samples", least=0, most=0xFFFF), period

@@ -64,22 +64,11 @@ def gap_record(parameters: ElectroadhesionParameters) -> Array:
 
 
 def estimate_attraction(record: Array, voltage: Array, current: Array, speed: Array) -> tuple[Array, Array]:
-    """Estimate the attraction of n samples, for a driver that measures both channels.
+    """Estimate the attraction (N) of n samples, and whether each is that of a nominal finger, both shape (n,).
 
-    Parameters
-    ----------
-    record : ndarray
-        From `gap_record`; changed in place, so that a run continues the one before.
-    voltage, current : ndarray of complex, shape (n,), V and A
-        Envelopes at the carrier; the modulus is the amplitude.  Non-finite values count as zero.
-    speed : ndarray, shape (n,), m/s
-        Of the finger, NaN while it is lifted.
-
-    Returns
-    -------
-    force : ndarray, shape (n,), N
-    open_loop : ndarray of bool, shape (n,)
-        Whether the force is that of a nominal finger, because the gap could not be measured.
+    For a driver that measures both channels: `voltage` (V) and `current` (A) are complex envelopes at the carrier, the
+    modulus the amplitude; what is not finite counts as zero.  `speed` (m/s) is that of the finger, NaN while it is
+    lifted; `record`, from `gap_record`, is changed in place, so that a run continues the one before.
     """
     force, open_loop = np.zeros(len(speed)), np.zeros(len(speed), bool)
     _gap_run(record, voltage.astype(complex), current.astype(complex), np.asarray(speed, float), force, open_loop)
