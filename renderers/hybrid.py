@@ -258,24 +258,16 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str
 
 
 def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:
-    """Band model of both, block by block; what is judged is a velocity, no multiple of the coordinates."""
-    from scipy.linalg import block_diag
-
-    parts = [plate] if friction is None else [plate, friction]
-    names = ("mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed", "side_from_coordinate")
-    matrices: dict[str, Array] = {name: block_diag(*(getattr(part, name) for part in parts)) for name in names}
-    common: dict[str, Any] = {name: getattr(plate, name) for name in ("rate", "delay", "block", "lowest_frequency")}
-    return CombinedModel(
-        **matrices,
-        **common,
-        place_from_coordinate=np.zeros((len(PLACES), len(matrices["mass"]))),
-        places=PLACES,
-        drive_limit=np.inf,
-        sensed_limit=np.inf,
-        highest_frequency=parts[-1].highest_frequency,
-        unit="m/s",
-        drive_unit="A, A, N",
-        plate=plate,
-        friction=friction,
-        velocity_per_force=velocity_per_force,
-    )
+    """Models of both; what is judged is a velocity, which no coordinate and no sensor of the plate shows."""
+    of_both: dict[str, Any] = {
+        "places": PLACES,
+        "shown": np.zeros((len(PLACES), SENSORS)),
+        "lever_per_metre": 0.0,
+        "drive_limit": np.inf,
+        "sensed_limit": np.inf,
+        "highest_frequency": (friction or plate).highest_frequency,
+        "unit": "m/s",
+        "drive_unit": "A, A, N",
+    }
+    own: dict[str, Any] = {"plate": plate, "friction": friction, "velocity_per_force": velocity_per_force}
+    return CombinedModel(**vars(plate) | of_both | own)
