@@ -15,7 +15,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
-from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
+from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.mathx import on_time, smoothstep
@@ -191,7 +191,7 @@ class HybridRenderer(BaseRenderer):
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
-        return design_combined(method, model, bands, feedback=feedback)  # type: ignore[arg-type]
+        return CombinedController(method, model, bands, feedback=feedback)  # type: ignore[arg-type]
 
 
 def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
