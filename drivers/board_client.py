@@ -10,12 +10,11 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import integer, number, require
-from hapticrender.control.supervisor import CAUSES
 from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
 from hapticrender.drivers.board_texture import BoardTexture, Pointed
-from hapticrender.drivers.protocol import SUPERVISOR, WRAP, Capabilities, Cause, Kind, State, Stream, Telemetry
+from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Stream, Telemetry
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Flag
 
@@ -26,13 +25,19 @@ LONGEST_GAP = 2**16  # rows
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise [limits] rms_drive",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
+    Cause.INVALID: "samples of a sensor are no numbers, or at the end of its range: check its cable and its range",
+    Cause.FROZEN: "a sensor repeats one value while the drive moves: check its cable, supply and converter",
+    Cause.INCONSISTENT: "the motion does not follow from the drive: check the wiring and polarity of sensors and coils",
+    Cause.ACTIVE: "the motion grows with the drive: check the polarity of sensors and coils",
+    Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier, and that the board's "
+    "sources were exported for the scene that needs most",
+    Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
+    Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
+    Cause.BEYOND: "a sensor shows more than [limits] displacement: press less, and check its unit and offset",
+    Cause.SENSOR_GAIN: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",
+    Cause.ACTUATOR_GAIN: "the motion is that of the inverted drive: check the wiring and polarity of coils and sensors",
+    Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
 }
-FAULTS |= {  # of the law's supervisor; the board does not say which sensor or actuator
-    cause: ": check ".join(CAUSES[cause - SUPERVISOR]).format(sensor="?", gain="?")
-    for cause in Cause
-    if cause > SUPERVISOR
-}
-FAULTS[Cause.DRIVE] += ", and that the board's sources were exported for the scene that needs most"
 Result = TypeVar("Result")
 
 

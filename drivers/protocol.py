@@ -18,7 +18,6 @@ MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
 DELIMITER = b"\0"
 WRAP = 2**32  # of times, and of numbers of samples
-SUPERVISOR = 16  # before the causes of `control.supervisor`
 
 
 class Kind(IntEnum):

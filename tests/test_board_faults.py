@@ -71,7 +71,7 @@ def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     """20 N at the end of the glass: 20/45.3e3 (1 + 2 * 2) = 2.2 mm there."""
     client = stepped.started()
     client.finger(0.055, 0.0, 20.0)
-    with pytest.raises(DeviceFault, match="the board stopped: the surface moved farther"):
+    with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         stepped.run(client, 0.2)
     stepped.assert_at_rest()
 
