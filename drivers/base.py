@@ -159,15 +159,7 @@ class BaseDriver(OpenedInWith):
         return self
 
     def play(self, drive: Array) -> Sensed:
-        """Play a block (block, drive_channels) and return what was sensed; sample i at the start of interval i.
-
-        Raises
-        ------
-        ValueError
-            The shape is wrong or a sample is not finite; nothing has been played.
-        DriverError
-            The driver is not open, or the device failed.
-        """
+        """Play a block (block, drive_channels) and return what was sensed; for times and errors see the module."""
         if self._state != "open":
             raise DriverError(f"{self}: play: it is {self._state}, not open; use it in a with statement")
         return self._play(checked_drive(drive, self.block, self.drive_channels))

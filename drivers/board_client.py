@@ -14,14 +14,14 @@ from hapticrender.drivers import protocol
 from hapticrender.drivers.base import OpenedInWith, carry_through
 from hapticrender.drivers.board_line import BAUD, PAUSE, BoardLine, Line, open_port
 from hapticrender.drivers.board_texture import BoardTexture, Pointed
-from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Telemetry
-from hapticrender.drivers.rows import Rows
+from hapticrender.drivers.protocol import WRAP, Capabilities, Cause, Kind, State, Stream, Telemetry
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, HapticError, WatchdogTimeout
-from hapticrender.protocols import Array
+from hapticrender.protocols import Array, Flag
 
 RETRY = 0.05  # s between two attempts to reach the board anew
 LEAST_WATCHDOG, MOST_WATCHDOG = 0.05, 65.0  # s
 DRIVE_ROWS = 24  # of drive in a frame
+LONGEST_GAP = 2**16  # rows
 FAULTS = {
     Cause.LIMIT: "the mean square of the drive is above its limit: lower the amplitude, or raise [limits] rms_drive",
     Cause.SENSOR: "a sensor was invalid for 10 ms: check its cable and its range",
@@ -39,6 +39,53 @@ FAULTS = {
     Cause.SWAPPED: "each sensor shows the motion of the other: check the wiring of sensors and coils",
 }
 Result = TypeVar("Result")
+
+
+class Rows:
+    """Rows of a run: drive (A), sensed (m), position (m), load (N), reference (m) and flags.
+
+    A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.  `first` is the sample of the board's
+    clock from which on it streams, that of the first row that comes unless given; `stride` the samples between two
+    rows, 0 where none are streamed.
+    """
+
+    def __init__(self, first: int | None = None, stride: int = 1) -> None:
+        self._stride = stride or 1
+        self._next = None if first is None else -(-first // self._stride) * self._stride
+        self._rows: list[Array] = []
+        self._last: Array | None = None
+        self._broken = False  # rows were lost; their number is unknown
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def restart(self, first: int) -> None:
+        """Go on with the same rows after the board began anew at sample `first`, on a clock that may be another."""
+        if self._missing(first) >= LONGEST_GAP:
+            self._next, self._broken = -(-first // self._stride) * self._stride, True
+
+    def _missing(self, first: int) -> int:
+        return 0 if self._next is None else (first - self._next) % WRAP // self._stride
+
+    def add(self, block: Stream) -> None:
+        """Append the rows of a frame, after those that were lost before it."""
+        rows, missing = np.array(block.rows), self._missing(block.first)
+        if missing >= LONGEST_GAP or not len(rows):
+            return  # of an earlier run
+        if self._broken:
+            rows[0, -1], self._broken = int(rows[0, -1]) | Flag.OVERRUN, False
+        if missing:
+            lost = np.array(rows[0] if self._last is None else self._last)
+            lost[-1] = int(lost[-1]) | Flag.OVERRUN
+            self._rows += [lost] * missing
+        self._rows += list(rows)
+        self._last = rows[-1]
+        self._next = (block.first + len(rows) * self._stride) % WRAP
+
+    def take(self, count: int | None = None) -> Array:
+        """Remove and return the first `count` rows, all unless given; shape (n, columns)."""
+        found, self._rows = self._rows[:count], self._rows[count:] if count is not None else []
+        return np.array(found)
 
 
 class _Setup(NamedTuple):
@@ -133,10 +180,7 @@ class BoardClient(OpenedInWith):
         texture fades out, with `Flag.OVERRUN`, and in again.  Returns the sample of the board's clock at which it took
         the bands.
 
-        Raises
-        ------
-        ValueError
-            The targets are no constant envelopes, there are too many bands, or the board refuses a number.
+        A ValueError where the targets are no constant envelopes, there are too many bands, or it refuses a number.
         """
         most = self.capabilities.bands
         if bands.envelope is None and (texture is None or len(bands)):
@@ -209,12 +253,8 @@ class BoardClient(OpenedInWith):
     def start(self, *, stream: int = 0, telemetry: float = 0.02) -> int:
         """Start to play the bands, or the texture, from rest; return the sample of the board's clock at which it began.
 
-        Parameters
-        ----------
-        stream : int
-            Samples between two rows that the board streams back; 0: none.
-        telemetry : float, s
-            Time between two frames of telemetry, 0.2 ms to 13 s at 5 kHz.
+        It streams a row back every `stream` samples, 0: none, and telemetry every `telemetry` s, 0.2 ms to 13 s at
+        5 kHz.
         """
         period = round(telemetry * self.capabilities.rate)
         start = integer("stream", stream, "samples", least=0, most=0xFFFF), period
@@ -242,14 +282,8 @@ class BoardClient(OpenedInWith):
     def telemetry(self) -> Telemetry:
         """Return the latest telemetry; wait for the first.
 
-        Raises
-        ------
-        DeviceLost
-            The line or the board is gone, and did not come back within `reconnect`.
-        DeviceFault
-            The board stopped by itself: the drive, or a sensor.
-        WatchdogTimeout
-            The board stopped as the application was silent, see `watch`.
+        A `DeviceLost` where line or board are gone and did not come back within `reconnect`, a `DeviceFault` where the
+        board stopped by itself, a `WatchdogTimeout` where it stopped as the application was silent (`watch`).
         """
 
         def wait(line: BoardLine) -> Telemetry:

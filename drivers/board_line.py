@@ -60,16 +60,8 @@ class BoardLine:
     """A session with a board, on a port of its own; not for several threads at once.
 
     It greets the board, sends keep-alives, and one command at a time until its reply.  Its parameters are those of
-    `BoardClient`; `connect` is called with port and baud rate.
-
-    Raises
-    ------
-    DeviceNotFound
-        There is no such port, or it cannot be opened.
-    DeviceTimeout
-        Nothing answers in the protocol.
-    ProtocolError
-        What answers has another version of it.
+    `BoardClient`.  A `DeviceNotFound` where the port cannot be opened, a `DeviceTimeout` where nothing answers in the
+    protocol, a `ProtocolError` where what answers has another version of it.
     """
 
     capabilities: Capabilities  # from the reply to HELLO on
@@ -146,8 +138,12 @@ class BoardLine:
         return self.send(kind, protocol.pack(kind, *fields))
 
     def send(self, kind: Kind, payload: bytes) -> Request:
-        """Do the same with a payload."""
-        return self._checked(self.request(kind, payload))
+        """Do the same with a payload, again and again until what the command waits for has faded out."""
+        end = self.clock.monotonic() + FADING
+        while True:
+            request = self.request(kind, payload)
+            if request.refused != Reason.STATE or self.clock.monotonic() >= end:
+                return self._checked(request)
 
     def request(self, kind: Kind, payload: bytes) -> Request:
         """Send a command and return its reply, a refusal too."""
@@ -162,7 +158,7 @@ class BoardLine:
     def begin(self, kind: Kind, *fields: float) -> int:
         """Start something, once the board has come to rest; return the sample at which it began."""
         self.streamed.clear()
-        sample = self._patiently(kind, protocol.pack(kind, *fields)).sample
+        sample = self.command(kind, *fields).sample
         self.telemetry = None  # what comes from now on is of this run
         return sample
 
@@ -182,7 +178,7 @@ class BoardLine:
         if texture is not None:
             frames = texture.frames(self._textures, self.clock.monotonic(), self.finger)
         for kind, payload in frames:
-            request = self._patiently(kind, payload)
+            request = self.send(kind, payload)
             if meanwhile is not None:
                 self.supply(meanwhile)
         if texture is not None:
@@ -210,14 +206,6 @@ class BoardLine:
 
     def _carried(self) -> str:
         return f"{self.sent_bytes} bytes sent, {self.received_bytes} received"
-
-    def _patiently(self, kind: Kind, payload: bytes) -> Request:
-        """Send a command again and again until what it waits for has faded out."""
-        end = self.clock.monotonic() + FADING
-        while True:
-            request = self.request(kind, payload)
-            if request.refused != Reason.STATE or self.clock.monotonic() >= end:
-                return self._checked(request)
 
     def _checked(self, request: Request) -> Request:
         """Return a command that was done; raise where it was refused."""

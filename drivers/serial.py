@@ -18,13 +18,15 @@ from hapticrender.bands import Bands
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
-from hapticrender.drivers.board_loop import BoardLoop, playable
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.errors import DriverError, HapticError
-from hapticrender.protocols import Array, Controller, DeviceLoop, Rendering, Sensed
+from hapticrender.drivers.protocol import Capabilities
+from hapticrender.errors import DeviceFault, DriverError, HapticError, WatchdogTimeout
+from hapticrender.protocols import Array, Controller, DeviceLoop, Flag, Rendering, Sensed
 
 LIST_TIMEOUT = 0.3  # s that a board has to answer where boards are listed
 HOST_BLOCK = 100  # samples of drive from the host
+TELEMETRY = 0.05  # s between two frames of telemetry in live play
+JUDGED = 0.25  # s of signal that the figures of a texture are of
 LONGEST_MEAN = 1000.0  # s, of a board; a mean over a shorter time has the larger peaks, and so stops no later
 
 
@@ -42,18 +44,14 @@ class SerialDriver(BaseDriver):
         Name of the serial port.
     finger : object with ``position(time)`` (m, NaN: lifted) and ``load(time)`` (N), optional
         Such as ``hapticrender.Finger``, from the start of the run on; `render` sets it to the scene's unless given.
-    block : int, >= 1
-        1: closed loop on the board.  More: drive from the host, a block a call, for identification; what it computes
-        from a block acts two blocks later.
     **options
         Of `BoardClient`.
     """
 
     device_kind: str  # of which the firmware has the law
-    play_delay: int  # samples, of a copy that plays the drive of the host
 
-    def __init__(self, port: str, *, finger: Any = None, block: int = 1, **options: Any) -> None:
-        self.client, self.options = BoardClient(port, **options), options
+    def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
+        self.client = BoardClient(port, **options)
         self.finger, self._sent, self._begun, self._last = finger, 0, False, np.full(1, np.nan)
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
@@ -64,30 +62,18 @@ class SerialDriver(BaseDriver):
             rate=found.rate,
             drive_channels=found.drive_channels,
             sensed_channels=found.sensed_channels,
-            block=block,
-            delay=found.delay + (2 * block if block > 1 else 0),
+            delay=found.delay,
         )
-
-    def driven_by_host(self) -> "SerialDriver":
-        """Return the same board as a device that plays the drive of the host, for identification."""
-        return self if self.block > 1 else SerialDriver(self.client.port, block=HOST_BLOCK, **self.options)
 
     @contextmanager
     def by_host(self) -> Iterator["SerialDriver"]:
-        """Let the open board play the drive of the host, and leave it at rest."""
+        """Let the open board play the drive of the host, which acts two blocks later, and leave it at rest."""
         board = copy(self)
-        if self.block == 1:
-            board.block = HOST_BLOCK
-            board.play_delay = self.delay + 2 * HOST_BLOCK
+        board.block, board.delay = HOST_BLOCK, self.delay + 2 * HOST_BLOCK
         try:
             yield board
         finally:
             self.client.stop()
-
-    @property
-    def host_delay(self) -> int:
-        """Samples of `delay` that the loop on the board itself does not have."""
-        return self.delay - int(self.capabilities.delay)
 
     @classmethod
     def found(cls) -> list[str]:
@@ -102,18 +88,11 @@ class SerialDriver(BaseDriver):
             return f"no board answers ({type(error).__name__})"
         return f"a board of {board.rate:g} Hz, {board.drive_channels} out, {board.sensed_channels} in"
 
-    def device_loop(self, controller: Controller) -> DeviceLoop | None:
-        """Return the board's own loop, with the scene's texture; None for a block device.
+    def device_loop(self, controller: Controller) -> DeviceLoop:
+        """Return the board's own loop, with the scene's texture.
 
-        Raises
-        ------
-        DriverError
-            The board cannot play this: it has the law of method "inverse".
-        ValueError
-            The board cannot play this texture, see `playable`.
+        A `DriverError` where the method is not that of the board's law; a ValueError where it cannot play the texture.
         """
-        if self.block != 1:
-            return None
         inner: Any = getattr(controller, "controller", controller)
         rendering = self.rendering
         if rendering is None or inner.method != "inverse":
@@ -146,7 +125,7 @@ class SerialDriver(BaseDriver):
             target *= 2j * np.pi * (bands.frequency + np.multiply.outer(speed, bands.wavenumber))
         return np.where(away & ((bands.wavenumber > 0.0) | bool(self.capabilities.friction)), 0.0, target)
 
-    def loop(self, rendering: Rendering) -> BoardLoop:
+    def loop(self, rendering: Rendering) -> "BoardLoop":
         """Return a loop of the board's own for live play, see `hapticrender.Player`."""
         return BoardLoop(rendering, self)
 
@@ -192,7 +171,7 @@ class SerialDriver(BaseDriver):
         """Queue a block on the board, one block ahead of what it plays, and return what was sensed in the block."""
         client = self.client
         if self.block == 1:
-            raise DriverError(f"{self}: play: the loop runs on the board; for drive from the host set block > 1")
+            raise DriverError(f"{self}: play: the loop runs on the board; for drive from the host use by_host()")
         if not self._begun:
             self._begun = True
             client.begin_queue()
@@ -211,3 +190,100 @@ class SerialDriver(BaseDriver):
 
     def __str__(self) -> str:
         return f"SerialDriver({self.client.port})"
+
+
+class BoardLoop:
+    """A rendering that plays on a board; what `hapticrender.live_loop.LiveLoop` is for a controller of this process.
+
+    A ValueError where a board cannot play its texture, which must be of displacements.
+    """
+
+    senses = False  # the host sends the finger's position
+
+    def __init__(self, rendering: Rendering, driver: SerialDriver) -> None:
+        self.rendering, self.driver, self.model = rendering, driver, rendering.model
+        self.samples, self.flags = 0, Flag(0)
+        self.motion_source = "sensors" if driver.sensed_channels else "unknown"
+        self._client = client = driver.client
+        self.finger, self.watch, self.alive, self.silence = client.finger, client.watch, client.beat, client.stop
+        self._bands, self._texture = self.made(rendering)
+        self._recent = np.zeros((0, 3))  # reference, motion and position, m
+        self._reconnections = 0  # that have been noted
+        self._fault: HapticError | None = None
+
+    def start(self) -> None:
+        """Set the bands and play; the port is open."""
+        self.driver.protect(self.rendering)
+        self._client.set_bands(self._bands, self._texture)
+        self._client.start(stream=1, telemetry=TELEMETRY)
+        self._reconnections = self._client.reconnections
+
+    def made(self, rendering: Rendering) -> tuple[Bands, BoardTexture | None]:
+        """Return what the board plays of a rendering; a ValueError where it cannot play it."""
+        return playable(rendering, self.driver.capabilities)
+
+    def replace(self, rendering: Rendering, bands: Bands, texture: BoardTexture | None) -> None:
+        """Change to what was `made` of another rendering of the device: within 20 ms from bands to bands, else 40."""
+        self._client.set_bands(bands, texture)
+        self.rendering, self._bands, self._texture = rendering, bands, texture
+
+    def set_gain(self, gain: float) -> None:
+        """Set the factor on the texture, 0 to 1."""
+        self._client.gain = gain
+
+    def fill(self) -> None:
+        """Check the telemetry; a `DriverError` where board or line are gone.
+
+        A board that was lost and found again plays a new run, whose carriers begin anew; what was lost is not counted.
+        """
+        if self._client.reconnections != self._reconnections:
+            self._reconnections = self._client.reconnections
+            self.flags |= Flag.OVERRUN
+        try:
+            self.flags |= self._client.telemetry().flags
+        except (DeviceFault, WatchdogTimeout) as fault:
+            self._fault = fault
+            self.flags |= Flag.STOPPED
+
+    def signals(self, start: int) -> tuple[int, dict[str, Array]]:
+        """Return the number of the first sample and the signals that the board has streamed since the last call."""
+        found = self.driver.signals(self._client.rows())
+        first, count = self.samples, len(found["flags"])
+        self.samples += count
+        senses = self.driver.sensed_channels > 0
+        motion = found["sensed"] @ self.model.place_from_sensed.T if senses else np.full((count, 1), np.nan)
+        recent = np.vstack([self._recent, np.stack([found["reference"], motion[:, 0], found["position"]], axis=1)])
+        self._recent = recent[-round(JUDGED * self.driver.rate) :]
+        return first, {**found, "motion": motion, "target": np.zeros((count, 0), complex)}
+
+    def figures(self) -> list[tuple[float, float, float, float]]:
+        """Return frequency (Hz), target, achieved (m) and relative error of every band, from the latest telemetry.
+
+        Of a texture that is no sum of bands the amplitudes are rms, over the last quarter of a second.
+        """
+        if self._texture is not None and len(self._recent):
+            reference, motion, _ = (self._recent - self._recent.mean(axis=0)).T
+            target, achieved, off = (float(np.sqrt(np.mean(x**2))) for x in (reference, motion, motion - reference))
+            return [(0.0, target, achieved, off / target if target > 0.0 else math.nan)]
+        speed = np.nan_to_num(abs(np.diff(self._recent[:, 2]))).sum() * self.driver.rate / max(len(self._recent) - 1, 1)
+        rows, frequency = [], self._bands.frequency + self._bands.wavenumber * speed
+        for hertz, band in zip(frequency, self._client.telemetry().bands, strict=False):
+            moves = float(hertz > 0.0)  # a grating under a finger that rests has no amplitude
+            size, error = moves * abs(band.target), abs(band.measured - band.target)
+            rows.append((float(hertz), size, moves * abs(band.measured), error / size if size > 0.0 else math.nan))
+        return rows
+
+    def fault(self) -> HapticError | None:
+        """Return why the board stopped the drive, if it did."""
+        return self._fault
+
+
+def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
+    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse.
+
+    A screen plays all as textures: its law makes friction of a waveform's derivative.
+    """
+    bands, texture = rendering.bands, rendering.scene.texture
+    if bands.envelope is not None and len(bands) and not (bands.modulated or board.friction):
+        return bands, None
+    return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model, rendering.waveform_of)

@@ -88,14 +88,14 @@ REFUSED = (ValueError, TypeError, ArithmeticError, RecursionError, MemoryError, 
 
 
 @contextmanager
-def noted_on(first: BaseException | None) -> Iterator[None]:
-    """Note what fails within, while a device is closed, on the error that came before; without one it is raised."""
+def noted_on(first: BaseException | None, during: str = "closing") -> Iterator[None]:
+    """Note what fails within, such as while `closing`, on the error that came before; without one it is raised."""
     try:
         yield
     except Exception as late:
         if first is None:
             raise
-        first.add_note(f"and while closing: {late}")
+        first.add_note(f"and while {during}: {late}")
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from hapticrender.control.supervisor_kernel import STOPPED
 from hapticrender.devices import check_calibration, open_driver
 from hapticrender.devices import registered as registered
 from hapticrender.driver_checks import check_sensed, opened_once
-from hapticrender.errors import DeviceFault, PlateMismatch
+from hapticrender.errors import DeviceFault, PlateMismatch, noted_on
 from hapticrender.inferred import ContactLag
 from hapticrender.mathx import on_time
 from hapticrender.process_signals import ended_with_program, stopped_by_signal
@@ -271,13 +271,9 @@ def opened(driver: Any, device: Driver, hangs: Callable[[], bool] = lambda: Fals
 
 def _rest(device: Driver, error: BaseException | None, hangs: Callable[[], bool]) -> None:
     """Play zeros until they have come through; a failure is noted on the error that there is already."""
-    try:
+    with noted_on(error, "the drive was set to zero"):
         if not (getattr(device, "zero_on_exit", False) or hangs()):
             play_zeros(device)
-    except Exception as second:
-        if error is None:
-            raise
-        error.add_note(f"and while the drive was set to zero: {second}")
 
 
 def _device_loop(driver: Driver, controller: Controller) -> DeviceLoop | None:

@@ -232,8 +232,6 @@ def identify(arguments: argparse.Namespace) -> int:
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
         driver = _driver(arguments.driver, scene)
-        if hasattr(driver, "driven_by_host"):  # a board, whose own loop is not what is identified
-            driver = driver.driven_by_host()
         plants: dict[str, Callable[[], Any]] = {
             "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
             "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
@@ -304,7 +302,7 @@ def latency(arguments: argparse.Namespace) -> int:
         outputs.check_file("--out", arguments.out)
     driver: Any = open_driver(arguments.driver)
     stated = "in [device] of the scene" if driver is None else ""
-    if hasattr(driver, "driven_by_host"):  # the loop runs on a board
+    if hasattr(driver, "by_host"):  # the loop runs on a board
         stated = f"by the design of the board: {driver.delay} samples at {driver.rate:g} Hz"
     if stated:
         print(printable(f"{arguments.driver}: nothing is measured or written: the delay is stated {stated}"))

@@ -1,12 +1,8 @@
 """Hybrid: low bands on a vibrotactile plate, high bands by the friction of an electroadhesion screen on it.
 
 The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  The
-shares of both sum to one at every frequency: the screen's is
-
-    s(f) = e(f/F - 1),   e(x) = x^2 (3 - 2 x) from 0 to 1,
-
-0 below F and 1 above 2 F, half at the crossover 1.5 F, and the plate's is 1 - s.  Of carriers that follow the finger
-each bank takes its share while the frequency goes up and down, by the fades that end its range.
+shares of both sum to one at every frequency (docs/theory.md, "Hybrid").  Of carriers that follow the finger each bank
+takes its share while the frequency goes up and down, by the fades that end its range.
 """
 
 import math
@@ -19,7 +15,7 @@ import numpy as np
 
 from hapticrender.bands import Bands
 from hapticrender.checks import Validated, check_names, inside, parameter, require
-from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel, design_combined
+from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.mathx import on_time, smoothstep
@@ -195,7 +191,7 @@ class HybridRenderer(BaseRenderer):
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
-        return design_combined(method, model, bands, feedback=feedback)  # type: ignore[arg-type]
+        return CombinedController(method, model, bands, feedback=feedback)  # type: ignore[arg-type]
 
 
 def _part_of(driver: Driver, drive: int, sensed: int, name: str) -> Driver:
@@ -262,24 +258,16 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str
 
 
 def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:
-    """Band model of both, block by block; what is judged is a velocity, no multiple of the coordinates."""
-    from scipy.linalg import block_diag
-
-    parts = [plate] if friction is None else [plate, friction]
-    names = ("mass", "damping", "stiffness", "force_from_drive", "coordinate_from_sensed", "side_from_coordinate")
-    matrices: dict[str, Array] = {name: block_diag(*(getattr(part, name) for part in parts)) for name in names}
-    common: dict[str, Any] = {name: getattr(plate, name) for name in ("rate", "delay", "block", "lowest_frequency")}
-    return CombinedModel(
-        **matrices,
-        **common,
-        place_from_coordinate=np.zeros((len(PLACES), len(matrices["mass"]))),
-        places=PLACES,
-        drive_limit=np.inf,
-        sensed_limit=np.inf,
-        highest_frequency=parts[-1].highest_frequency,
-        unit="m/s",
-        drive_unit="A, A, N",
-        plate=plate,
-        friction=friction,
-        velocity_per_force=velocity_per_force,
-    )
+    """Models of both; what is judged is a velocity, which no coordinate and no sensor of the plate shows."""
+    of_both: dict[str, Any] = {
+        "places": PLACES,
+        "shown": np.zeros((len(PLACES), SENSORS)),
+        "lever_per_metre": 0.0,
+        "drive_limit": np.inf,
+        "sensed_limit": np.inf,
+        "highest_frequency": (friction or plate).highest_frequency,
+        "unit": "m/s",
+        "drive_unit": "A, A, N",
+    }
+    own: dict[str, Any] = {"plate": plate, "friction": friction, "velocity_per_force": velocity_per_force}
+    return CombinedModel(**vars(plate) | of_both | own)

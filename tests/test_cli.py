@@ -38,7 +38,7 @@ class Hosted:
 
     rate, delay = 5000.0, 3
 
-    def driven_by_host(self):
+    def by_host(self):
         raise NotImplementedError
 
 

@@ -9,8 +9,8 @@ from held import amplitude_error, envelopes, fixed, hold, play
 from waves import phasor
 
 import hapticrender as hr
+from examples.grigorii2021.shaping import butterworth, loop_margins, reduced_controller
 from hapticrender.control.controller import setpoint_rows
-from hapticrender.control.loopshape import butterworth, loop_margins, reduced_controller
 from hapticrender.control.methods import METHODS, Polar
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY, LIGHT_SECOND

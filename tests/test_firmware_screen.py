@@ -13,9 +13,8 @@ from test_firmware_law import CAREFUL
 
 import hapticrender as hr
 from hapticrender.bands import Bands, hold_last
-from hapticrender.drivers.board_loop import playable
 from hapticrender.drivers.protocol import Cause
-from hapticrender.drivers.serial import SerialDriver
+from hapticrender.drivers.serial import SerialDriver, playable
 from hapticrender.errors import DeviceFault
 from hapticrender.export import export
 from hapticrender.plants.sliding_contact import SlidingParameters

@@ -21,9 +21,9 @@ SIGMAS_95 = 1.96
 LIGHT = (0.2e-3, 1.5, 1e3)  # kg, N s/m, N/m: skin, Grigorii et al. 2021, table 1
 
 
-def found(expected=PAPER, how=None, **plate):
+def found(expected=PAPER, **plate):
     with OtherPlate(**plate) as driver:
-        return identify(driver, expected, **(how or {}))
+        return identify(driver, expected)
 
 
 def truth_of(plate):
@@ -62,7 +62,7 @@ def test_one_second_of_100_um_meets_the_target(eight):
         assert (error <= [3e-3] * 4 + [1e-2] * 2 + [0.01, 0.003]).all()
         assert identified.explained
         assert identified.parameters.delay == plate["delay"]
-        late = [str(each) for each in identified.differences(PAPER) if each.name == "delay"]
+        late = [each for each in identified.differences(PAPER) if each.startswith("delay")]
         assert len(late) == (plate["delay"] > 1)
         assert all(re.fullmatch(r"delay \+\d\.\d{4} \+- 0\.00\d\d samples", each) for each in late)
         assert (f"set it to {plate['delay']}" in identified.text()) == (plate["delay"] > 1)
@@ -218,9 +218,9 @@ def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):
     other = dataclasses.replace(PAPER, mass=PAPER.mass / 0.95, stiffness_1=PAPER.stiffness_1 / 1.05)
     assert one.differences(PAPER) == ()
     near = dataclasses.replace(PAPER, stiffness_1=PAPER.stiffness_1 / 1.005)
-    assert [each.name for each in one.differences(near)] == ["stiffness_1"]
-    assert [each.name for each in one.differences(other)] == ["mass", "stiffness_1"]
-    text = "; ".join(map(str, one.differences(other)))
+    assert [each.split()[0] for each in one.differences(near)] == ["stiffness_1"]
+    assert [each.split()[0] for each in one.differences(other)] == ["mass", "stiffness_1"]
+    text = "; ".join(one.differences(other))
     assert re.match(r"mass -[45]\.\d\d \+- 0\.0\d %; stiffness_1 \+[45]\.\d\d", text)
 
 
@@ -234,7 +234,6 @@ def test_a_delay_longer_than_the_wait_is_found():
 def test_a_finger_is_refused_by_its_load_or_by_its_motion():
     with pytest.raises(hr.DesignError, match=r"static load = 0\.(19|2)\d* N: must be within \+-0.05 N; remove"):
         found(load=0.2, position=27.5e-3)
-    assert found(how={"contact": 0.3}, load=0.2).load == pytest.approx(0.2, rel=0.01)
     with pytest.raises(hr.DesignError, match=r"unexplained motion = \d+\.?\d* %: must be <= 1 %; remove the finger"):
         found(finger=LIGHT, position=15e-3)
 

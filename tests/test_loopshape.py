@@ -1,25 +1,30 @@
 """Loop shaping: the controllers, their margins to the last printed digit, and the loop slowed down for its delay."""
 
+from math import radians
+
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import bilinear, lfilter
 
-from examples.grigorii2021.shaping import analyse, exact_controller
-from hapticrender.bands import Bands
-from hapticrender.control.demodulator import StarSTDFT
-from hapticrender.control.loopshape import (
+from examples.grigorii2021.shaping import (
     TransferFunction,
+    analyse,
     butterworth,
-    envelope_loop,
+    exact_controller,
     loop_margins,
     reduced_controller,
 )
-from hapticrender.control.margins import LEAST
+from hapticrender.bands import Bands
+from hapticrender.control.demodulator import StarSTDFT
+from hapticrender.control.loopshape import MOST_DELAY, envelope_loop, loop_section
+from hapticrender.control.margins import LeastMargins
+from hapticrender.control.methods import MOST_INTEGRAL
 from hapticrender.errors import DesignError
 from hapticrender.plants.plate import PlateParameters
 
 RATE = 5000.0
 L = butterworth(10.0)
+LEAST = LeastMargins(modulus=1 / 1.8, gain=2.5, phase=radians(45.0), delay=0.0)  # docs/theory.md, "Margins"
 CONTROLLERS = {
     "exact": exact_controller(5.0, 10.0),
     "reduced": reduced_controller(5.0, 10.0),
@@ -83,6 +88,11 @@ def test_gain_and_delay_margins_are_the_edges_of_stability(form):
         assert loop_margins(CONTROLLERS[form] * L, factor * margins.delay).stable is stable
 
 
+def as_filter(section):
+    """Second-order section (b0, b1, b2, a1, a2) as (b, a)."""
+    return np.array(section[:3]), np.array([1.0, *section[3:]])
+
+
 def envelope_loop_run(controller, low_pass, reference):
     """Output of the envelope loop with plant 1 behind a sample of delay; controller and low pass as (b, a)."""
     states, output = [np.zeros(2), np.zeros(2)], [0.0]
@@ -99,30 +109,43 @@ def test_the_discretised_loop_has_the_predicted_response(frequency):
     controller = CONTROLLERS["reduced"]
     turn = np.exp(2j * np.pi * frequency * np.arange(3 * int(RATE)) / RATE)
     low_pass = StarSTDFT(bandwidth=10.0, rate=RATE).coefficients
-    output = envelope_loop_run(controller.tustin(RATE), low_pass, turn.real)
+    output = envelope_loop_run(as_filter(loop_section(5.0, 10.0, RATE)), low_pass, turn.real)
     measured = 2 * np.mean(output[5000:] * turn[5000:].conjugate())  # whole periods of every frequency
     forward = controller.frequency_response(frequency) * np.exp(-2j * np.pi * frequency / RATE)
     predicted = forward / (1 + forward * L.frequency_response(frequency))
     assert measured == pytest.approx(predicted, rel=3e-4)  # Tustin warps by (pi f/rate)^2/3: 3e-5 at 15 Hz
 
 
-def test_tustin_gives_the_printed_digits_and_is_exact_at_the_prewarped_frequency():
+def test_the_section_has_the_printed_digits_and_the_low_pass_is_exact_at_the_prewarped_frequency():
     """The second-order controller at 5 kHz."""
-    b, a = reduced_controller(5.0, 10.0).tustin(RATE)
+    b, a = as_filter(loop_section(5.0, 10.0, RATE))
     np.testing.assert_allclose(b, 1.3043570e-5 * np.array([1, 2, 1]), rtol=0, atol=1e-12)
     np.testing.assert_allclose(a, [1, -1.9823849911, 0.9823849911], rtol=0, atol=5e-11)
+    continuous = reduced_controller(5.0, 10.0)
+    for found, known in zip((b, a), bilinear(continuous.numerator, continuous.denominator, RATE), strict=True):
+        np.testing.assert_allclose(found, known, rtol=1e-9)
     b, a = StarSTDFT(bandwidth=10.0, rate=RATE).coefficients
     z = np.exp(2j * np.pi * 10.0 / RATE)
     assert np.polyval(b, z) / np.polyval(a, z) == pytest.approx(L.frequency_response(10.0), rel=1e-8)
 
 
 @pytest.mark.parametrize("width", [5.0, 5e-5])
-def test_tustin_keeps_every_coefficient_of_a_loop_however_slow(width):
+def test_a_section_keeps_every_coefficient_however_slow(width):
     """The numerator of a slow loop at the rate of a sound card is 1e-19 (1 + z^-1)^2."""
-    slow = reduced_controller(width, 2 * width)
-    b, _ = slow.tustin(96e3)
+    b, _ = as_filter(loop_section(width, 2 * width, 96e3))
     np.testing.assert_allclose(b / b[0], [1, 2, 1], rtol=1e-12)
-    assert b[0] == pytest.approx(slow(2 * 96e3), rel=1e-12)
+    assert b[0] == pytest.approx(reduced_controller(width, 2 * width)(2 * 96e3), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("loop", "delay"),
+    [(reduced_controller(5.0, 10.0) * L, MOST_DELAY / 5.0), (CONTROLLERS["integrator"], MOST_INTEGRAL / 17.0)],
+    ids=["loop and low pass", "integrator"],
+)
+def test_the_longest_delay_is_where_the_least_margins_end(loop, delay):
+    """In any loop of that form: only the product of bandwidth and delay counts."""
+    for factor, kept in ((0.99999, True), (1.00001, False)):
+        assert (LEAST.complaint(loop_margins(loop, factor * delay)) == "") is kept
 
 
 def loop_of(delay, frequency=20.0):
@@ -138,10 +161,12 @@ def test_a_loop_is_a_quarter_of_the_carrier_or_as_wide_as_its_delay_allows():
     delay = 200 / RATE
     assert width < 5.0
     for found, each in ((loop_of(1)[0], 5.0), (settings, width)):
-        b, a = reduced_controller(each, 2 * each).tustin(RATE)
-        assert found["loop"] == pytest.approx([*b, *a[1:]])
+        assert found["loop"] == loop_section(each, 2 * each, RATE)
     for each, kept in ((width, True), (width / 0.9, False)):
         margins = loop_margins(reduced_controller(each, 2 * each) * butterworth(2 * each), delay)
-        assert (LEAST["envelope"].complaint(margins) == "") is kept
-    with pytest.raises(DesignError, match=r"unstable even with a loop of 0.2\d\d Hz: lower the delay of 5 s"):
+        assert (LEAST.complaint(margins) == "") is kept
+    with pytest.raises(
+        DesignError,
+        match=r"delay of 5 s leaves too small a margin: must be <= 0.1\d+ s, even with a loop of 0.2\d\d Hz: lower it",
+    ):
         loop_of(25_000)

@@ -25,9 +25,7 @@ from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
 from hapticrender.loop import prepare
-from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.friction_laws import FitLaw
-from hapticrender.plants.hybrid import HybridPlant
 from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
@@ -66,14 +64,6 @@ def plate(gradient=0.0, **parameters):
 def exported(bands=0, **changes):
     scene = {"texture": TWO_TONES, "duration": 1.0}
     return board_design(hr.prepare(hr.Scene(**scene | changes)), bands)
-
-
-def hybrid(velocity_per_force=0.64, **parameters):
-    return HybridPlant(
-        Plate(PlateParameters(**parameters), SLIDE),
-        ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE),
-        velocity_per_force,
-    )
 
 
 def demodulator(**changes):
@@ -242,8 +232,6 @@ PLANTS = [
         "temperature_rise = 100.0: shifts the resonance by up to -1800 Hz, must be within 1500 Hz",
     ),
     (lambda: FitLaw().amplitude(0.1, 0.5, 0.1), r"ratio = 0.1: must be .*>= 0.100001 .*and <= 1"),
-    (lambda: hybrid(), r"plate.rate = 5000.0: must be 10000.0"),
-    (lambda: hybrid(0.0, rate=10e3), r"velocity_per_force=0.0: must be > 0"),
 ]
 SCENES = [
     (lambda: plate(2.0, coils=1), "gradient = 2.0: must be 0 1/m: a plate with one coil"),

@@ -102,7 +102,7 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
     """Images past the 300th hold less than 2 f^2 F/(300^2 rate^3) < 4e-9 of it, with F the offset or the pole."""
     parameters = UltrasonicParameters(temperature_time=1e-3, **IDEAL)
     if level == "envelope":
-        parameters = parameters.transposed(6e3, 48e3)
+        parameters = parameters.sampled(48e3, "envelope")
     frequency = parameters.carrier + offset
     expected = sum(held(parameters, frequency, load))
     assert abs(respond(parameters, frequency, finger) / expected - 1) < 2 * SETTLED + 4e-9
@@ -112,7 +112,7 @@ def test_measured_response_is_the_predicted_one(level, finger, load, offset):
 def test_the_envelope_error_is_that_of_the_responses(load, offset):
     """Which `test_measured_response_is_the_predicted_one` holds at either level."""
     carrier = UltrasonicParameters(**IDEAL)
-    both = carrier, carrier.transposed(6e3, 48e3)
+    both = carrier, carrier.sampled(48e3, "envelope")
     gain = [each.force_constant / each.dynamic_stiffness(each.carrier + offset, load) for each in both]
     assert gain[0] / gain[1] - 1 == pytest.approx(complex(carrier.envelope_error(offset, load)), rel=1e-12)
 

@@ -21,7 +21,7 @@ from benchmarks.charts.poles import logarithms
 from hapticrender.control.demodulator import StarSTDFT
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import DiscretePlant
-from hapticrender.control.loopshape import reduced_controller
+from hapticrender.control.loopshape import loop_section
 from hapticrender.protocols import Array
 
 
@@ -82,7 +82,7 @@ class PolarLoop:
         alike = model.response(frequency) @ np.ones(len(sides)) @ measured.T
         widths, which = np.unique(bandwidth, return_inverse=True)
         filters = [StarSTDFT(bandwidth=2 * b, rate=model.rate).coefficients for b in widths]
-        laws = [reduced_controller(b, 2 * b).tustin(model.rate) for b in widths]
+        laws = [loop_section(b, 2 * b, model.rate) for b in widths]
         return cls(
             plant=plant,
             delay=model.delay,
@@ -91,7 +91,7 @@ class PolarLoop:
             force=model.force_from_drive @ drive_map,
             table=np.abs(alike * model.hold_and_delay(frequency)[:, None]),
             low_pass=np.array([[*b, *a[1:]] for b, a in filters])[which],
-            law=np.array([[*b, *a[1:]] for b, a in laws])[which],
+            law=np.array(laws)[which],
         )
 
     def envelope_response(self, offset: Array) -> Array:

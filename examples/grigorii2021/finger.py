@@ -13,8 +13,7 @@ import numpy as np
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.formulas import FILTER, FREQUENCIES, FREQUENCY, GRID, LOOP
-from examples.grigorii2021.shaping import analyse
-from hapticrender.control.loopshape import TransferFunction, butterworth, reduced_controller
+from examples.grigorii2021.shaping import TransferFunction, analyse, butterworth, reduced_controller
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics
 

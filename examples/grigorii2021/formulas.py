@@ -14,8 +14,13 @@ from scipy.signal import butter, freqz, lfilter
 from scipy.special import stdtr
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
-from examples.grigorii2021.shaping import analyse, exact_controller
-from hapticrender.control.loopshape import TransferFunction, butterworth, reduced_controller
+from examples.grigorii2021.shaping import (
+    TransferFunction,
+    analyse,
+    butterworth,
+    exact_controller,
+    reduced_controller,
+)
 from hapticrender.plants.plate import PlateParameters
 
 LOOP, FILTER, LOWEST = 5.0, 10.0, 20.0  # Hz: bandwidths of T and L, and the lowest carrier

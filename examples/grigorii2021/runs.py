@@ -16,8 +16,8 @@ from scipy.signal import butter, lfilter
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.formulas import FILTER, FREQUENCIES, FREQUENCY, LOOP
+from examples.grigorii2021.shaping import butterworth
 from hapticrender import Finger, Grating, Recording, Scene, render
-from hapticrender.control.loopshape import butterworth
 from hapticrender.plants.plate import PLACES, PlateParameters
 from hapticrender.touch.mechanics import HEAVY
 

@@ -98,31 +98,28 @@ def combined_step(state, signals, start, count):
 
 
 class CombinedController(Addressed):
-    """Two controllers behind the `Controller` protocol, of plate and friction device; `design_combined` makes one.
+    """Controllers of one method for plate and friction device, with their shares of the targets, as one `Controller`.
 
-    A part is None where it has no target and stays without drive; `sensors` and `channels` are numbers of each part,
-    `heat_decay` is what a sample leaves of the heat of a part without target (see `supervisor_kernel.limit_rms_drive`).
+    A part is None where it has no target and stays without drive.  Without feedback both drive open loop.
     """
 
-    def __init__(
-        self,
-        parts: tuple[BankController | None, BankController | None],
-        bands: CombinedBands,
-        velocity_per_force: float,
-        sensors: tuple[int, int],
-        channels: tuple[int, int],
-        method: str,
-        heat_decay: tuple[float, float] = (1.0, 1.0),
-    ) -> None:
-        self.method, self.parts, self.bands, self.n_bands = method, parts, bands, len(bands)
-        self.step, self.part_channels = combined_step, channels
+    def __init__(self, method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True) -> None:
+        refuse_whole_waveform(bands, "a hybrid", "recordings over position")
+        self.method, self.bands, self.n_bands, self.step = getattr(method, "name", ""), bands, len(bands), combined_step
+        shares = (model.plate, bands.plate), (model.friction, bands.friction)
+        self.parts = tuple(_designed(method, each, own, feedback) for each, own in shares)
+        sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
+        self.part_channels = channels = (model.plate.force_from_drive.shape[1], 1)
         self.channels, self.sensors = sum(channels), sum(sensors)
-        self.rate = next((part.rate for part in parts if part is not None), 0.0)
-        self.block = max(part.block if part is not None else 1 for part in parts)
+        self.rate = next((part.rate for part in self.parts if part is not None), 0.0)
+        self.block = max(part.block if part is not None else 1 for part in self.parts)
         self.state = record_of(COMBINED, self, bands=self.n_bands)
         self._buffers: list[Array] = []
-        shares = ((bands.plate_index, 0.0, 1.0), (bands.friction_index, velocity_per_force, 1.0 / velocity_per_force))
-        for i, (part, (index, scale, per_target)) in enumerate(zip(parts, shares, strict=True)):
+        # of a part without target the heat decays, see `supervisor_kernel.limit_rms_drive`; limits are the plate's
+        heat_decay = math.exp(-self.block / (model.plate.rms_time * model.rate)), 1.0
+        scales = (0.0, 1.0), (model.velocity_per_force, 1.0 / model.velocity_per_force)
+        indices = [np.ascontiguousarray(each, np.int64) for each in (bands.plate_index, bands.friction_index)]
+        for i, (part, (scale, per_target)) in enumerate(zip(self.parts, scales, strict=True)):
             count = 0 if part is None else part.n_bands
             arrays = {
                 "sensed": np.zeros((self.block, sensors[i])),
@@ -132,8 +129,8 @@ class CombinedController(Addressed):
                 "flags": np.zeros(self.block, np.int64),
                 "position": np.zeros(self.block),
             }
-            indices, signals = np.ascontiguousarray(index, np.int64), addresses(**arrays)
-            self._buffers += [*arrays.values(), indices, signals]
+            signals = addresses(**arrays)
+            self._buffers += [*arrays.values(), indices[i], signals]
             values: dict[str, Any] = {f"{name}_at": array for name, array in arrays.items()}
             if part is not None:
                 bank = getattr(part, "controller", part)
@@ -142,13 +139,13 @@ class CombinedController(Addressed):
                 PART,
                 **values,
                 signals=signals,
-                index=indices,
+                index=indices[i],
                 bands=count,
                 sensors=sensors[i],
                 channels=channels[i],
                 scale=scale,
                 scale_waveform=per_target if bands.envelope is None else 1.0,
-                heat_decay=heat_decay[i] ** self.block,
+                heat_decay=heat_decay[i],
             )
             self.state["parts"][0, i] = own[0]
 
@@ -178,19 +175,8 @@ class CombinedController(Addressed):
     run = BankController.run
 
 
-def design_combined(
-    method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
-) -> CombinedController:
-    """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
-    refuse_whole_waveform(bands, "a hybrid", "recordings over position")
-    models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
-    parts: list[Any] = []
-    for each, own in zip(models, shares, strict=True):
-        part: Any = method.design(each, own, feedback=feedback) if each is not None and len(own) else None
-        parts.append(part if part is None or each is None else supervised(part, each, feedback=feedback))
-    sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
-    channels = (model.plate.force_from_drive.shape[1], 1)
-    heat_decay = math.exp(-1.0 / (model.plate.rms_time * model.rate)), 1.0  # limits of rms drive are the plate's
-    name = getattr(method, "name", "")
-    both = parts[0], parts[1]
-    return CombinedController(both, bands, model.velocity_per_force, sensors, channels, name, heat_decay)
+def _designed(method: Method, model: DeviceModel | None, bands: Bands, feedback: bool) -> Any:
+    """Return a supervised controller of one part; None where it has no target."""
+    if model is None or not len(bands):
+        return None
+    return supervised(method.design(model, bands, feedback=feedback), model, feedback=feedback)

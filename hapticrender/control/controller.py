@@ -218,6 +218,7 @@ def device_settings(model: DeviceModel) -> dict[str, Any]:
     return {
         **{name: padded(getattr(model, name), 2, 2) for name in ("mass", "damping", "stiffness")},
         "pattern": np.append(model.pattern, [0.0])[:2],
+        "dynamic": True,
         "needs_contact": model.finger.needs_contact,
         "least_speed": model.finger.least_speed,
     }

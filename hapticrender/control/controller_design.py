@@ -107,12 +107,8 @@ def design_controller(
     It runs in blocks where the delay is that of a block device (more than 8 samples), else sample by sample.  Without
     feedback nothing is sensed, and the law drives open loop.
 
-    Raises
-    ------
-    DesignError
-        No bandwidth keeps the least margins.
-    ValueError
-        There are no carriers, two are equal, or the device has too many coordinates, channels or sensors.
+    A `DesignError` where no bandwidth keeps the least margins; a ValueError where there are no carriers, two are equal,
+    or the device has too many coordinates, channels or sensors.
     """
     refuse_whole_waveform(bands)
     rules = rules.scaled(model.pace)

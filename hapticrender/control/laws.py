@@ -1,4 +1,4 @@
-"""Compiled force of the law by bands: dynamic stiffness, finger included, turned ahead by delay and hold.
+"""Compiled force of the laws that invert the device: dynamic stiffness with a finger, turned ahead by delay and hold.
 
     F = rho (D V + D' dV/dt + j dw/dt M V),   rho = e^(j w lead) (w T/2)/sin(w T/2)
 
@@ -63,10 +63,10 @@ def set_law(controller, t):
             mass = p.mass[i, j] + other * (one * (on * c.finger_mass))
             damping = p.damping[i, j] + other * (one * (on * c.finger_damping + lag))
             stiffness = p.stiffness[i, j] + other * (one * (on * c.finger_stiffness))
-            d = pair(stiffness - omega * omega * mass, omega * damping + sweep * mass)
+            d = pair(stiffness - omega * omega * mass, omega * damping + p.dynamic * sweep * mass)
             law = record(stiffnesses_of(controller, t), STIFFNESS_T, 2 * i + j)
             put(law, "d", d * ahead + other * (one * spring))
-            put(law, "s", pair(damping, 2.0 * mass * omega) * ahead)
+            put(law, "s", p.dynamic * pair(damping, 2.0 * mass * omega) * ahead)
 
 
 @kernel

@@ -1,15 +1,10 @@
 """The step of the methods that estimate by a low pass: polar loops, and complex loops with the free device's inverse.
 
 With a carrier e^(j phi) and y a coordinate, a band's envelope is X = L[2 y e^(-j phi)], L a second-order low pass or
-the mean over a window; C is the loop controller, R the reference envelope (docs/theory.md, "Loop shaping of the
-paper"; Grigorii et al. 2021, eqs. 1-5).  Polar, with s = +-1 the sign of the carrier's frequency and g, theta_D gain
-and phase of the free device from a table over frequency::
-
-    A = max(C[|R| - |X|], 0),   theta = -C[s arg(X conj R)],   u = sum A/g cos(phi + arg R + s theta)
-
-so that a carrier that runs backwards is followed as its mirror image.  Without feedback A = |R| and theta makes up for
-theta_D, delay and hold.  Complex: V = C[shape R - X], or V = shape R + C[-X] of the deviation from the reference, and
-F = rho D(jw) V, or rho (D V + D' dV/dt + j dw/dt M V), of the free device; see `laws` for rho.
+the mean over a window; C is the loop controller, R the reference envelope.  The laws are those of docs/theory.md, "Loop
+shaping of the paper" (Grigorii et al. 2021, eqs. 1-5).  In the polar one the sign of a carrier's frequency turns the
+phase, so that a carrier that runs backwards is followed as its mirror image; without feedback the amplitude is |R| and
+the phase makes up for that of the device, delay and hold.  The complex ones hand V to `laws`, static without D'.
 """
 
 import math
@@ -18,9 +13,21 @@ from numba import carray
 
 from hapticrender.control.carriers import advance_carriers, update_targets
 from hapticrender.control.kernel import LEAK, analyse_sample, sense_block, update_confidence
-from hapticrender.control.laws import turn_ahead
+from hapticrender.control.laws import apply_law, update_law
 from hapticrender.control.peak_limit import SATURATED, drive_of
-from hapticrender.control.records import CONTROLLER_T, FIXED, LOCKED, LOW_PASS_T, PAIR_T, SUM, TILE_T, W, Y, samples_of
+from hapticrender.control.records import (
+    CONTROLLER_T,
+    COORDINATE_T,
+    FIXED,
+    LOCKED,
+    LOW_PASS_T,
+    PAIR_T,
+    TILE_T,
+    W,
+    Y,
+    coordinates_of,
+    samples_of,
+)
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, polar, unit
 from hapticrender.vectors import conj, get, imag, magnitude, maximum, pair, put, real, sqrt, square, total, where, zeros
@@ -118,7 +125,7 @@ def polar_loops(controller, t, i, envelope):
 
 @kernel
 def polar_law(controller):
-    """Drive of every coordinate by the polar law, into the rows SUM of `samples`.
+    """Drive of every coordinate by the polar law, into the rows Y of `samples`.
 
     Without feedback the device's lag, delay and hold are made up for.
     """
@@ -139,7 +146,7 @@ def polar_law(controller):
             turn, wave = unit((1.0 / TURN) * angle), get(b, "r_phasor") * get(b, "carrier")
             wave = real(wave) * real(turn) - get(b, "omega_sign") * imag(wave) * imag(turn)
             drive = drive + get(x, "drive") * amplitude * wave
-        samples[SUM + i, 0] = total(drive)
+        samples[Y + i, 0] = total(drive)
     c.stale = 0
 
 
@@ -148,6 +155,7 @@ def complex_loops(controller, t, i, envelope):
     """Update V and dV/dt of a tile in coordinate i; without feedback V is the reference."""
     c = record(controller, CONTROLLER_T, 0)
     b, x, p = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
+    own = record(coordinates_of(controller, t), COORDINATE_T, i)
     reference, weight = p.pattern[i] * get(b, "r"), get(b, "weight")
     against = 0.0 if p.deviation > 0.0 else 1.0
     out = loop_controller(controller, x, p.feedback * weight * (against * reference - envelope), -math.inf)
@@ -155,42 +163,29 @@ def complex_loops(controller, t, i, envelope):
     put(x, "law1", keep * get(x, "law1"))
     put(x, "law2", keep * get(x, "law2"))
     v = out + p.forward * reference
-    put(x, "slope", p.rate * (v - get(x, "v")))
+    put(own, "slope", p.rate * (v - get(x, "v")))
+    put(own, "v", v - reference)  # the law adds it
     put(x, "v", v)
 
 
 @kernel
 def complex_law(controller):
-    """Force of every coordinate by the complex law and the free device's D, into the rows SUM of `samples`."""
+    """Force of every coordinate by the complex law and the free device's D, into the rows Y of `samples`."""
     c = record(controller, CONTROLLER_T, 0)
-    samples, n, p = samples_of(controller), c.p.coordinates, c.p
+    samples, p, reference = samples_of(controller), c.p, zeros()
     if p.deviation > 0.0:
-        reference = zeros()
         for t in range(c.tiles):
             b = record(c.tiles_at, TILE_T, t)
             reference = reference + real(get(b, "r") * get(b, "carrier"))
-        for i in range(n):
-            samples[Y + i, 0] -= p.pattern[i] * total(reference)
-    for i in range(n):
-        samples[SUM + i, 0] = 0.0
+    expected = total(reference)
     for t in range(c.tiles):
-        b = record(c.tiles_at, TILE_T, t)
-        if c.stale > 0 or b.mode[0] == LOCKED:
-            turn_ahead(controller, t)
-        for i in range(n):
+        for i in range(p.coordinates):
             envelope = pair(zeros(), zeros())
             if p.feedback > 0.0:
-                envelope = estimate(controller, t, i, samples[Y + i, 0])
+                envelope = estimate(controller, t, i, samples[Y + i, 0] - p.pattern[i] * expected)
             complex_loops(controller, t, i, envelope)
-        omega, wave = get(b, "omega"), get(b, "ahead") * get(b, "carrier")
-        for i in range(n):
-            for j in range(n):
-                x, mass, damping = record(c.loops_at, LOW_PASS_T, j * c.tiles + t), p.mass[i, j], p.damping[i, j]
-                across = damping * omega + p.dynamic * mass * get(b, "sweep")
-                force = pair(p.stiffness[i, j] - mass * omega * omega, across) * get(x, "v")
-                force = force + p.dynamic * pair(damping, 2.0 * mass * omega) * get(x, "slope")
-                samples[SUM + i, 0] += total(real(force * wave))
-    c.stale = 0
+    update_law(controller, False, False)
+    apply_law(controller)
 
 
 @kernel
@@ -232,7 +227,7 @@ def low_pass_step(state, signals, start, count):
         else:
             complex_law(state)
         for i in range(p.channels):
-            exact = c.confidence * drive_of(state, samples, SUM, 0, i)
+            exact = c.confidence * drive_of(state, samples, Y, 0, i)
             drive[n, i] = min(max(exact, -limit), limit)
             if abs(exact) > limit:
                 flags[n] |= SATURATED

@@ -83,10 +83,8 @@ LEAST = {
     "law": LeastMargins(modulus=0.29, gain=1.4),  # bands share one residual: 20 Hz apart they leave 0.30 and 1.42
     "damper": LeastMargins(modulus=1 / 1.7, gain=2.5, phase=math.radians(60.0)),
     "spread": LeastMargins(modulus=0.2, delay=0.0, phase=0.0, gain=1.0),
-    "envelope": LeastMargins(modulus=1 / 1.8, gain=2.5, phase=math.radians(45.0), delay=0.0),
 }
-"""Least margins by use: the error observer's law; the inner damper, and with the bending mode at an end of its spread;
-the low-pass loop of one envelope."""
+"""Least margins by use: the error observer's law; the inner damper, and with a bending mode at an end of its range."""
 
 
 def carrier_grid(carriers: Array, widths: Array, rate: float) -> Array:

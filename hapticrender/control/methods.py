@@ -32,9 +32,8 @@ from hapticrender.control.controller_design import ONE_SPEED, Rules, design_cont
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import DiscretePlant
-from hapticrender.control.loopshape import Bandwidths, TransferFunction, envelope_loop, loop_margins, section
+from hapticrender.control.loopshape import Bandwidths, envelope_loop
 from hapticrender.control.low_pass import low_pass_step
-from hapticrender.control.margins import LEAST
 from hapticrender.control.records import LOW_PASS, W, aligned
 from hapticrender.defaults import FADE_IN
 from hapticrender.errors import DesignError
@@ -43,6 +42,7 @@ from hapticrender.protocols import Array, Method
 TABLE_STEP = 0.5  # Hz, resolution of the look-up table
 CONTACT_FADE = 0.02  # s: targets of the polar methods that follow the finger fade in and out with contact
 HIGHEST_EDGE = 1.25  # of the highest frequency, where position-locked carriers have faded out
+MOST_INTEGRAL = 0.613034  # an integrator's gain times the delay: leaves a modulus margin of 1/1.8
 ALL_PASS = (1.0, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -135,8 +135,7 @@ class Resonant:
     -----
     From motion to force an integrator is ``-ki [D(jw)/(s - jw) + D'(jw) + conj. at -jw]``.  At a mode w1 of mass m and
     stiffness m w1^2 that is ``+j w1 2 ki m``: negative damping of 2 ki m from every band.  All together must stay below
-    the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate: 16.1 1/s for the rocking of the paper's plate.
-    Delay and hold leave 3 % more for low carriers and take the limit away for those above the modes.
+    the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate.
     """
 
     gain: float = 15.0  # 1/s, sum of ki over the bands, > 0, below the decay rate of the least damped mode
@@ -145,19 +144,20 @@ class Resonant:
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design integrators; a `DesignError` where the gain drives a mode, or the delay leaves no margin."""
-        controller = TransferFunction((self.gain / max(len(bands), 1),), (1.0, 0.0))
+        each, period = self.gain / max(len(bands), 1), 1.0 / model.rate
         if feedback and self.checked:
-            least = least_decay(model)
+            least, late = least_decay(model), model.delay * period
             if self.gain >= least:
                 raise DesignError(
                     f"gain={self.gain:g} 1/s must be below {least:.3g} 1/s, the decay rate of the least damped mode, "
                     f"which it takes away: lower gain"
                 )
-            found = loop_margins(controller, model.delay / model.rate)
-            if complaint := LEAST["envelope"].complaint(found):
-                raise DesignError(f"{complaint}: lower gain={self.gain:g} 1/s or the loop's delay")
+            if each * late > MOST_INTEGRAL:
+                bound = f"must be <= {MOST_INTEGRAL / late:.3g} 1/s a band behind a delay of {late:.3g} s"
+                raise DesignError(f"too small a margin: gain={each:g} 1/s {bound}: lower it, or the delay")
         settings = complex_settings(model, bands, model.lowest_frequency / 4, False, feedback)
-        settings |= {"low_pass": ALL_PASS, "loop": section(controller.tustin(model.rate))}
+        half = 0.5 * each * period
+        settings |= {"low_pass": ALL_PASS, "loop": (half, half, 0.0, -1.0, 0.0)}
         return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
 
 

@@ -62,15 +62,15 @@ class Found(NamedTuple):
 def probe_plate(driver: Driver, model: Any) -> None:
     """Probe an open plate of two actuators and two sensors up to three times, and leave it at rest.
 
-    It is probed by `play`, whose delay is longer than that of the model where the driver has a `play_delay`; a board,
-    whose loop is its own, by the drive of the host.  Of a hybrid the plate is probed, the screen without drive.  A
+    It is probed by `play`, whose delay may be longer than that of the model (`play_delay`); a board, whose loop is its
+    own, by the drive of the host.  Of a hybrid the plate is probed, the screen without drive.  A
     `DeviceFault` where a deviation from the model was found in every try.
     """
     places, model = len(model.places), getattr(model, "plate", model)
     drive = probe_drive(model)
     for _ in range(TRIES):
         with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
-            delay = model.delay + getattr(player, "play_delay", player.delay) - player.delay
+            delay = model.delay + getattr(player, "play_delay", player.delay) - driver.delay
             played = replace(model, delay=delay, block=player.block)
             sensed, lost = play_probe(player, drive, places, REST)
         last = judge(played, drive, sensed[:, : len(ONE)])

@@ -63,9 +63,9 @@ TILE_FIELDS = [
 ]
 WORK_FIELDS = _complex("x", "rise", "y", "up")
 """Of a tile and coordinate in a block: an envelope and its rise over the block; the same turned to a group."""
-LOW_PASS_FIELDS = [*_complex("low1", "low2", "law1", "law2", "v", "slope"), *("drive", "lag")]
+LOW_PASS_FIELDS = [*_complex("low1", "low2", "law1", "law2", "v"), *("drive", "lag")]
 """Of a tile in a coordinate of a method with low passes: states of low pass and loop controller, of which the polar
-law has amplitude (re) and phase (im); V and dV/dt; drive per metre and lag (rad) of the free device."""
+law has amplitude (re) and phase (im); V; drive per metre and lag (rad) of the free device."""
 
 
 def _record(names: list[str]) -> np.dtype:

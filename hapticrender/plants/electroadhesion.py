@@ -1,12 +1,9 @@
 """An electroadhesive screen: a current on a carrier, the circuit of screen and skin, attraction, friction, tribometer.
 
-Insulator, stratum corneum, sliding gap and body are in series; a current of peak I attracts with ``g I^2`` on average
-whatever the gap's thickness (docs/theory.md, "Electroadhesion").  A resting finger shorts its gap with sweat and is not
-attracted.  The current that is measured is that of the source, with what a stray capacitance across it takes.
-
-Two levels: "carrier" integrates the circuit over every substep exactly, with the compliance of the current source;
-"envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap
-for a few of its time constants.
+The equations are those of docs/theory.md, "Electroadhesion".  A resting finger shorts its gap with sweat and is not
+attracted.  Two levels: "carrier" integrates the circuit over every substep exactly, with the compliance of the current
+source; "envelope" takes ``g I^2``.  They agree but for what a step of the envelope leaves in the gap for a few of its
+time constants.
 """
 
 from __future__ import annotations
@@ -38,11 +35,9 @@ LEAST_SUBSTEPS = 4  # in a turn of the carrier
 class SquareRoot(Validated):
     """Square root that makes an attraction, which goes with current squared, linear in the drive.
 
-    An attraction u (N) around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``.  `straight` omits
-    the square root, for comparison: ``I = sqrt(2 bias/g) (1 + u/bias)/2``, with the same peak at u = bias and the same
-    slope of attraction at zero, and ``g I^2 = bias/2 + u + u^2/(2 bias)`` has a second harmonic of 25 % at u = bias
-    sin(2 pi f t).  Grigorii et al. 2021 drive 6 mA sqrt((sin(2 pi f t) + 1)/2), which has cusps where it touches zero;
-    the floor rounds them off: the slope of the current is at most 1/(2 sqrt(floor gain)).
+    An attraction u (N) around a bias takes the current envelope ``I = sqrt(max(bias + u, floor)/g)``, whose slope is at
+    most 1/(2 sqrt(floor g)).  `straight` omits the square root, for comparison: ``I = sqrt(2 bias/g) (1 + u/bias)/2``,
+    with the same peak at u = bias and the same slope of attraction at zero.
 
     Examples
     --------

@@ -1,11 +1,9 @@
 """Estimate the attraction on an electroadhesive finger from the impedance of its gap at the carrier.
 
-The equations are those of docs/theory.md, "Gap estimation" (Shultz, Peshkin, Colgate 2018), on the complex envelopes of
-voltage and current, low-passed by the STDFT*.  The force follows |I|^2 at once; only the impedance is averaged over a
-longer time, weighted by power, so that an envelope may pass through zero.  The force cannot be estimated while the
-finger is away or rests, before it has rested once, or when its gap leaks so much that L falls below a bound.  The
-output is then F = g |I|^2, what a control loop expects of a nominal finger, so that no integrator winds up, and
-`Flag.OPEN_LOOP` is raised.
+The equations are those of docs/theory.md, "Gap estimation" (Shultz, Peshkin, Colgate 2018).  The force follows |I|^2
+at once; only the impedance is averaged over a longer time, weighted by power, so that an envelope may pass through
+zero.  While the finger is away or rests, before it has rested once, or when its gap leaks too much, the output is
+F = g |I|^2, as of a nominal finger, so that no integrator winds up, and `Flag.OPEN_LOOP` is raised.
 """
 
 from __future__ import annotations
@@ -66,22 +64,11 @@ def gap_record(parameters: ElectroadhesionParameters) -> Array:
 
 
 def estimate_attraction(record: Array, voltage: Array, current: Array, speed: Array) -> tuple[Array, Array]:
-    """Estimate the attraction of n samples, for a driver that measures both channels.
+    """Estimate the attraction (N) of n samples, and whether each is that of a nominal finger, both shape (n,).
 
-    Parameters
-    ----------
-    record : ndarray
-        From `gap_record`; changed in place, so that a run continues the one before.
-    voltage, current : ndarray of complex, shape (n,), V and A
-        Envelopes at the carrier; the modulus is the amplitude.  Non-finite values count as zero.
-    speed : ndarray, shape (n,), m/s
-        Of the finger, NaN while it is lifted.
-
-    Returns
-    -------
-    force : ndarray, shape (n,), N
-    open_loop : ndarray of bool, shape (n,)
-        Whether the force is that of a nominal finger, because the gap could not be measured.
+    For a driver that measures both channels: `voltage` (V) and `current` (A) are complex envelopes at the carrier, the
+    modulus the amplitude; what is not finite counts as zero.  `speed` (m/s) is that of the finger, NaN while it is
+    lifted; `record`, from `gap_record`, is changed in place, so that a run continues the one before.
     """
     force, open_loop = np.zeros(len(speed)), np.zeros(len(speed), bool)
     _gap_run(record, voltage.astype(complex), current.astype(complex), np.asarray(speed, float), force, open_loop)

@@ -1,12 +1,9 @@
 """A screen laminated on a plate: the plate moves the finger, the screen rubs it, and both add to one skin velocity.
 
-Velocities that feel alike add in phase, with v/F = 0.64 m/(N s) (docs/theory.md, "Hybrid"; Grigorii et al. 2021)::
-
-    v = d/dt (displacement of the glass under the finger) + (v/F) (friction)
-
-The plate carries the finger's load alone, as attraction presses skin and glass on each other as much as it pulls;
-friction acts along the plate and does not move it.  Left out are the motion of the gap, and what the plate's vibration
-makes of friction: the match v/F was measured by fingers that slid over a vibrating plate.
+Velocities that feel alike add in phase (docs/theory.md, "Hybrid").  The plate carries the finger's load alone, as
+attraction presses skin and glass on each other as much as it pulls; friction acts along the plate and does not move it.
+Left out are the motion of the gap, and what the plate's vibration makes of friction: the match v/F was measured by
+fingers that slid over a vibrating plate.
 """
 
 from typing import Any
@@ -78,8 +75,8 @@ class HybridPlant(CompiledPlant):
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
     senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
     plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
-    the skin velocity that matches a newton of friction, > 0.  A ValueError where plate and screen differ in rate, delay
-    or finger, or the plate has a single coil.
+    the skin velocity that matches a newton of friction.  The plate has two coils; both parts have one rate, a delay of
+    a sample and one finger, as is checked where a scene is read.
     """
 
     step = hybrid_step
@@ -87,16 +84,6 @@ class HybridPlant(CompiledPlant):
     motion_channels = 3
 
     def __init__(self, plate: Plate, screen: CompiledPlant, velocity_per_force: float) -> None:
-        for name, found, needed in (
-            ("rate", plate.rate, screen.rate),
-            ("delay", plate.delay, screen.delay),
-            ("finger", plate.finger, screen.finger),
-            ("coils", plate.drive_channels, COILS),
-        ):
-            if found != needed:
-                raise ValueError(f"plate.{name} = {found}: must be {needed} with this screen")
-        if not velocity_per_force > 0.0:
-            raise ValueError(f"{velocity_per_force=}: must be > 0 m/(N s)")
         super().__init__(screen.finger, screen.rate)
         self.plate, self.screen = plate, screen
         self.noise_channels = plate.noise_channels + screen.noise_channels

@@ -9,7 +9,7 @@ damped, since the force is known through the drive alone.  Every control law sca
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ import numpy as np
 from hapticrender.checks import require
 from hapticrender.devices import naming_driver, open_driver, registered
 from hapticrender.driver_checks import check_channels, check_driver, check_sensed
-from hapticrender.errors import DesignError
+from hapticrender.errors import DesignError, noted_on
 from hapticrender.plants.fitting import (
     BENDING,
     CLEAREST,
@@ -47,7 +47,7 @@ from hapticrender.touch.finger import Finger
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
 UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlateParameters)} | {"gain_difference": ""}
 RAMP = 0.05  # s: fade-in and fade-out of the drive
-LEAST_WAIT = 0.25  # s: least time from the first motion to the record
+WAIT, LEAST_WAIT = 0.3, 0.25  # s, from the first drive to the record; from the first motion, behind a long delay
 SIGMAS_95 = 1.96
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
@@ -65,22 +65,6 @@ class Estimate(NamedTuple):
 
     value: float
     interval: float
-
-
-class Difference(NamedTuple):
-    """A significant difference; `interval` is the half-width of its 95 % interval."""
-
-    name: str
-    found: float
-    designed: float
-    interval: float
-
-    def __str__(self) -> str:
-        change = self.found - self.designed
-        if self.name in (*MECHANICAL, *BENDING) and self.designed:
-            relative = 100 / self.designed
-            return f"{self.name} {change * relative:+.2f} +- {abs(self.interval * relative):.2f} %"
-        return f"{self.name} {change:+.4f} +- {self.interval:.4f} {UNITS[self.name]}".rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,15 +140,19 @@ class Identified:
         coil = self.estimates.get("bending_coil", Estimate(0.0, 1.0))
         return abs(coil.value) / coil.interval * SIGMAS_95
 
-    def differences(self, designed: PlateParameters) -> tuple[Difference, ...]:
-        """Return the estimates that differ from `designed` by more than twice their interval."""
-        expected = {name: getattr(designed, name) for name in (*MECHANICAL, "delay", *BENDING)}
+    def differences(self, designed: PlateParameters) -> tuple[str, ...]:
+        """State every estimate that differs from `designed` by more than twice its interval, and by how much."""
+        expected = {name: float(getattr(designed, name)) for name in (*MECHANICAL, "delay", *BENDING)}
         expected["gain_difference"] = sensor_gains(designed)[1]
-        return tuple(
-            Difference(name, estimate.value, float(expected[name]), estimate.interval)
-            for name, estimate in self.estimates.items()
-            if abs(estimate.value - expected[name]) > SIGNIFICANT * estimate.interval
-        )
+        found = []
+        for name, (value, interval) in self.estimates.items():
+            change, known = value - expected[name], expected[name]
+            if abs(change) > SIGNIFICANT * interval:
+                share = known != 0.0 and name in (*MECHANICAL, *BENDING)
+                scale, digits, unit = (100.0 / known, 2, "%") if share else (1.0, 4, UNITS[name])
+                text = f"{name} {change * scale:+.{digits}f} +- {abs(interval * scale):.{digits}f} {unit}"
+                found.append(text.rstrip())
+        return tuple(found)
 
 
 def identify(
@@ -172,10 +160,7 @@ def identify(
     parameters: PlateParameters,
     *,
     seconds: float = 1.0,
-    wait: float = 0.3,
     amplitude: float = 100e-6,
-    contact: float = CONTACT,
-    unexplained: float = UNEXPLAINED,
 ) -> Identified:
     """Identify the free plate behind a driver from the response to a multi-sine.
 
@@ -188,15 +173,11 @@ def identify(
     parameters : PlateParameters
         Expected plate; electronics, geometry, the mean of the sensor gains and the modal mass of a bending mode, which
         only scales its shape at the coils, are taken as given.
-    seconds, wait : float, s
-        Length of the record, enough to resolve the narrowest mode; and from the first drive to the record, >= 0.1 s,
-        longer where the driver's delay is above 0.05 s: delays up to wait - 0.05 s are identified.
+    seconds : float, s
+        Length of the record, enough to resolve the narrowest mode.  It begins 0.3 s after the first drive, later where
+        the driver's delay is above 0.05 s: delays of 0.25 s are identified, and of 0.2 s beyond that stated.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate; less where the driver's `drive_limit` allows less.
-    contact : float, N, > 0
-        Bound of the static load.
-    unexplained : float, > 0
-        Bound of the share of the motion that the model leaves unexplained.
 
     Raises
     ------
@@ -210,25 +191,25 @@ def identify(
 
     Notes
     -----
-    With 1 um of noise at 5 kHz, 1 s of 100 um gives m, I and k to 0.05 %, b to 0.25 %, the delay to 0.002 samples
-    and the gain difference to 0.001 (95 % intervals); they shrink as 1/amplitude and as 1/sqrt(seconds).
-
-    A symmetric bending mode below 2.2 kHz (0.44 times the rate) is found from a shape at the coils of about 0.003 on;
-    what lies below 5 standard deviations is taken for none.  0.1 at 1250 Hz and Q 30 is clear by 240 of them: its
-    frequency comes within 0.3 Hz, its damping and shape at the coils within 1 %.
-
+    Intervals shrink as 1/amplitude and as 1/sqrt(seconds).  A symmetric bending mode below 2.2 kHz (0.44 times the
+    rate) is found from a shape at the coils of about 0.003 on; what lies below 5 standard deviations is taken for none.
     Errors of the model show in `misfit`: a command of 10 bits taken for 12 leaves 1 % of the motion.
     """
     if isinstance(driver, str):
-        options = {"wait": wait, "amplitude": amplitude, "contact": contact, "unexplained": unexplained}
         made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
-        made = made.driven_by_host() if hasattr(made, "driven_by_host") else made
         with stopped_by_signal(), naming_driver(driver), made as opened:
-            found = identify(opened, parameters, seconds=seconds, **options)
+            found = identify(opened, parameters, seconds=seconds, amplitude=amplitude)
         return found.shortened(getattr(made, "host_delay", 0))
+    with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
+        found = _fitted(player, parameters, seconds, amplitude)
+    return found.shortened(player.delay - driver.delay)
+
+
+def _fitted(driver: Driver, parameters: PlateParameters, seconds: float, amplitude: float) -> Identified:
+    """As `identify`, by the open driver's `play`."""
     rate = float(driver.rate)
-    samples = _samples(driver, parameters, seconds, wait)
-    wait = max(wait, driver.delay / rate + LEAST_WAIT)
+    samples = _samples(driver, parameters, seconds)
+    wait = max(WAIT, driver.delay / rate + LEAST_WAIT)
     parameters = replace(parameters, rate=rate)
     sine = design_multisine(parameters, rate, samples, amplitude)
     if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
@@ -248,7 +229,7 @@ def identify(
     except np.linalg.LinAlgError as error:
         raise DesignError(f"{seconds=:g} s: does not determine all parameters; lengthen the record") from error
     found = _identified(fit, record, driver)
-    _check_free(found, record, contact, unexplained)
+    _check_free(found, record)
     return found
 
 
@@ -264,15 +245,14 @@ def _with_bending(rigid: Fit, record: Record) -> Fit | None:
     return fit if clear > CLEAREST else None
 
 
-def _samples(driver: Driver, parameters: PlateParameters, seconds: float, wait: float) -> int:
+def _samples(driver: Driver, parameters: PlateParameters, seconds: float) -> int:
     """Check the arguments and return the length of the record in samples."""
     check_driver(driver)
     check_channels(driver, {2: "both coils, to identify a plate"}, {2: "a displacement sensor at each end of it"})
     for name in ("coils", "degrees_of_freedom"):
         found = getattr(parameters, name)
         require(found == 2, name, found, "2 to identify heave and rocking")
-    for name, value, least in (("seconds", seconds, 0.0), ("wait", wait, 2 * RAMP)):
-        require(math.isfinite(value) and value >= least, name, value, f">= {least:g} s")
+    require(0.0 <= seconds < math.inf, "seconds", seconds, ">= 0 s")
     return round(seconds * driver.rate)
 
 
@@ -321,10 +301,8 @@ def _play_once(driver: Driver, drive: Array) -> Sensed:
                 raise SamplesLost(f"sample {start}: the device reports {raised.name}, in {TRIES} tries: {cure}")
             kept.append([None if each is None else each.copy() for each in sensed])
     except BaseException as error:
-        try:
+        with noted_on(error, "sending zero drive"):
             driver.play(np.zeros_like(padded[:block]))
-        except Exception as late:
-            error.add_note(f"and while sending zero drive: {late}")
         raise
     columns: Any = [None if each[0] is None else np.concatenate(each)[:n] for each in zip(*kept, strict=True)]
     return Sensed(*columns)
@@ -377,16 +355,16 @@ def _identified(fit: Fit, record: Record, driver: Driver) -> Identified:
     )
 
 
-def _check_free(found: Identified, record: Record, contact: float, unexplained: float) -> None:
+def _check_free(found: Identified, record: Record) -> None:
     """Refuse a plate with a static load, and motion that the model does not explain."""
-    if not abs(found.load) <= contact:
+    if not abs(found.load) <= CONTACT:
         raise DesignError(
-            f"static load = {found.load:.3g} N: must be within +-{contact:g} N; remove the finger, or zero the sensors"
+            f"static load = {found.load:.3g} N: must be within +-{CONTACT:g} N; remove the finger, or zero the sensors"
         )
     lines = record.sensed[record.lines]
     share = found.residual / math.sqrt((abs(lines) ** 2).mean() * len(lines) / 2)
-    if not (found.explained or share <= unexplained):
+    if not (found.explained or share <= UNEXPLAINED):
         raise DesignError(
-            f"unexplained motion = {100 * share:.3g} %: must be <= {100 * unexplained:g} %; remove the finger; if none "
+            f"unexplained motion = {100 * share:.3g} %: must be <= {100 * UNEXPLAINED:g} %; remove the finger; if none "
             "touches, geometry or force constant in [device] do not match the plate"
         )

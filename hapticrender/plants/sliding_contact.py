@@ -36,10 +36,8 @@ class SlidingParameters(Validated):
 
     Notes
     -----
-    delta is 11.5 um where the cut-off v/(2 pi delta) grows by 13.8 Hz per mm/s, as measured over 20-100 mm/s and
-    0.2-0.6 N (Balasubramanian, Pool and Vardar 2025).  The tribometer is that of Grigorii et al. 2021: resonance at
-    1.3 kHz, flat within +-0.5 dB over 20-400 Hz.  Friction coefficient, damping, noise and range are engineering
-    defaults.
+    Memory length and tribometer are those of docs/theory.md, "Sliding contact"; friction coefficient, damping, noise
+    and range are engineering defaults.
     """
 
     rate: float = parameter(10e3, "Hz", "sampling rate of the surface", least=1e3, most=1e6)

@@ -83,18 +83,14 @@ class UltrasonicParameters(Validated):
                     f"must be within {MOST_SHIFT * self.carrier:g} Hz of a carrier of {self.carrier:g} Hz"
                 )
 
-    def sampled(self, rate: float) -> "UltrasonicParameters":
-        """Return the same plate at `rate` (Hz); the sensor's noise keeps its density."""
-        return replace(self, rate=rate, sensor_noise=self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate))
+    def sampled(self, rate: float, level: str | None = None) -> "UltrasonicParameters":
+        """Return the same plate at `rate` (Hz) and another level of the model, where one is given.
 
-    def transposed(self, frequency: float, rate: float) -> "UltrasonicParameters":
-        """Return the same plate at level "envelope": its mode on a carrier of `frequency` (Hz) at `rate` (Hz).
-
-        The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with
-        it grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
+        The sensor's noise keeps its density, so that it disturbs the envelope alike; its resolution stays, and with it
+        grows the density of rounding.  The delay stays in samples: at a lower rate it is a longer one.
         """
         noise = self.sensor_noise * math.sqrt(max(rate, 0.0) / self.rate)
-        return replace(self, level="envelope", envelope_frequency=frequency, rate=rate, sensor_noise=noise)
+        return replace(self, rate=rate, level=level or self.level, sensor_noise=noise)
 
     @property
     def carrier(self) -> float:

@@ -8,9 +8,8 @@ closed form: with s = b/2m, w_d = sqrt(w^2 - s^2), and e the distance to where t
 
 Velocities are scaled by the sample period, so that all states are in m.
 
-A sample of the surface is a few samples of the carrier.  The reference of friction becomes one of amplitude by the
-inverse of the friction law; the amplitude's own controller follows it along a straight line; and the amplitude leaves
-a friction by the law itself.
+A sample of the surface is a few samples of the carrier: the amplitude's controller follows, along a straight line, the
+reference that the inverse of the friction law makes of that of friction.
 """
 
 import math

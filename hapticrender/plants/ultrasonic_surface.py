@@ -86,9 +86,7 @@ class SurfaceParameters(SlidingParameters):
     @cached_property
     def carrier_mode(self) -> UltrasonicParameters:
         """The mode as it is simulated."""
-        if self.level == "carrier":
-            return self.mode.sampled(self.rate * self.substeps)
-        return self.mode.transposed(self.mode.envelope_frequency, self.rate * self.substeps)
+        return self.mode.sampled(self.rate * self.substeps, self.level)
 
     @property
     def substeps(self) -> int:
