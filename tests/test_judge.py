@@ -394,6 +394,8 @@ def test_a_spur_is_felt_as_it_moves_the_place_whatever_its_share(profile, place,
     figures = summary["waveform"]["places"][f"end_{place}"]
     assert summary["verdict"] == found
     assert figures["third_octaves"]["200 Hz"] == pytest.approx(0.2 * times_threshold, rel=0.03)
+    scale = 20 * UM * max(abs(profile[place]), 0.1 * max(profile))
+    assert figures["waveform_error"] == pytest.approx(error[place] / scale, rel=0.01)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05])
