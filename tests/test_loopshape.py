@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 
 from examples.grigorii2021.shaping import analyse, exact_controller
 from hapticrender.bands import Bands
@@ -81,29 +80,6 @@ def test_gain_and_delay_margins_are_the_edges_of_stability(form):
         assert (poles.real.max() < 0) == stable
         assert loop_margins(louder * L).stable is stable
         assert loop_margins(CONTROLLERS[form] * L, factor * margins.delay).stable is stable
-
-
-def envelope_loop_run(controller, low_pass, reference):
-    """Output of the envelope loop with plant 1 behind a sample of delay; controller and low pass as (b, a)."""
-    states, output = [np.zeros(2), np.zeros(2)], [0.0]
-    for wanted in reference:
-        estimate, states[0] = lfilter(*low_pass, output[-1:], zi=states[0])
-        drive, states[1] = lfilter(*controller, wanted - estimate, zi=states[1])
-        output.append(drive[0])
-    return np.array(output[:-1])
-
-
-@pytest.mark.parametrize("frequency", [0.5, 5.0])
-def test_the_discretised_loop_has_the_predicted_response(frequency):
-    """A slow reference through the loop at 5 kHz, one sample of delay in it, against T(f) with that delay."""
-    controller = CONTROLLERS["reduced"]
-    turn = np.exp(2j * np.pi * frequency * np.arange(3 * int(RATE)) / RATE)
-    low_pass = StarSTDFT(bandwidth=10.0, rate=RATE).coefficients
-    output = envelope_loop_run(controller.tustin(RATE), low_pass, turn.real)
-    measured = 2 * np.mean(output[5000:] * turn[5000:].conjugate())  # whole periods of every frequency
-    forward = controller.frequency_response(frequency) * np.exp(-2j * np.pi * frequency / RATE)
-    predicted = forward / (1 + forward * L.frequency_response(frequency))
-    assert measured == pytest.approx(predicted, rel=3e-4)  # Tustin warps by (pi f/rate)^2/3: 3e-5 at 15 Hz
 
 
 def test_tustin_gives_the_printed_digits_and_is_exact_at_the_prewarped_frequency():
