@@ -50,20 +50,24 @@ def played(screen):
     """Error of the friction at 100 Hz over the last 0.2 s, and the recording."""
     texture = hr.Grating(frequency=100.0, amplitude=0.64 * FORCE / (2 * np.pi * 100.0))
     fields = {"profile": {"sensor": "impedance"}, "simulation": {"level": "carrier"}, "keep_unfelt": True}
-    scene = hr.Scene(texture=texture, finger=FINGER, device="electroadhesion", duration=0.6, settle=0.4, **fields)
+    scene = hr.Scene(texture=texture, finger=FINGER, device="electroadhesion", duration=0.8, settle=0.4, **fields)
     recording = hr.render(scene, driver=screen)
-    return abs(phasor(np.array(screen.friction[4_000:6_000]), 100.0, screen.rate)) / FORCE - 1, recording
+    return abs(phasor(np.array(screen.friction[6_000:8_000]), 100.0, screen.rate)) / FORCE - 1, recording
 
 
 @pytest.mark.parametrize(("area", "gap"), [(0.5e-4, 0.5e-6), (0.94e-4, 3e-6)])
 def test_the_gap_that_a_driver_measures_closes_the_loop(area, gap):
-    """Area -30 and +30 %: within the 3 % of the estimator; open loop +58 and -41 %.  It is inferred, so not judged."""
+    """Area -30 and +30 %: within the 3 % of the estimator.  It is inferred, so not judged."""
     error, recording = played(ImpedanceScreen(area, gap, NORMAL))
     assert abs(error) < 0.03
     assert not (recording.flags[round((REST + 0.01) * recording.rate) :] & hr.Flag.OPEN_LOOP).any()
     assert recording.summary()["verdict"] == "not judged"
-    blind, _ = played(ImpedanceScreen(area, gap, NORMAL, senses=False))
-    assert abs(blind) > 0.3
+
+
+def test_open_loop_the_gap_is_missed():
+    """By +58 and -41 %."""
+    error, _ = played(ImpedanceScreen(0.94e-4, 3e-6, NORMAL, senses=False))
+    assert abs(error) > 0.3
 
 
 def test_a_gap_that_leaks_too_much_is_flagged():
