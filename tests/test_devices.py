@@ -88,19 +88,19 @@ def test_a_text_that_names_no_driver_is_refused_with_what_there_is(text, error, 
         open_driver(text)
 
 
-def test_a_missing_package_is_named_with_the_command_that_installs_it(tmp_path, monkeypatch):
-    (tmp_path / "my_card.py").write_text("import sounddevice\n\nclass Card:\n    pass\n")
+@pytest.mark.parametrize(
+    ("module", "source", "message"),
+    [
+        ("my_card", "import sounddevice", r'sounddevice.*to get it: pip install "hapticrender\[audio\]"'),
+        ("my_driver", "1 / 0", "my_driver cannot be loaded: ZeroDivisionError"),
+    ],
+)
+def test_a_module_that_fails_or_lacks_a_package_is_named(tmp_path, monkeypatch, module, source, message):
+    (tmp_path / f"{module}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(sys.modules, "sounddevice", None)
-    with pytest.raises(ValueError, match=r'sounddevice.*to get it: pip install "hapticrender\[audio\]"'):
-        open_driver("my_card:Card")
-
-
-def test_a_module_of_ones_own_that_fails_is_named(tmp_path, monkeypatch):
-    (tmp_path / "my_driver.py").write_text("1 / 0")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(hr.HapticError, match="my_driver cannot be loaded: ZeroDivisionError"):
-        open_driver("my_driver:Driver")
+    with pytest.raises((ValueError, hr.HapticError), match=message):
+        open_driver(f"{module}:Driver")
 
 
 def test_python_takes_the_same_texts(tmp_path):

@@ -30,9 +30,12 @@ def test_what_must_be_reached_is(case):
     assert {each.target.key for each in found if not each.passed} == ON_THE_STRANGERS_PLATE[case], found
 
 
-@pytest.mark.parametrize("finger", FINGERS, ids=["light-2", "heavy-2", "light", "heavy"])
+@pytest.mark.parametrize("finger", FINGERS[2:], ids=["light", "heavy"])
 def test_a_recorded_swipe_is_played_within_what_it_must(shared_data, finger):
-    """Lateral force of a finger at 40 mm/s, 4.6 to 6.9 s of the recording, in time: 2 / 4 %."""
+    """Lateral force of a finger at 40 mm/s, 4.6 to 6.9 s of the recording, in time: 2 / 4 %.
+
+    Of four fingers these are the worst, the light one in the middle (0.7 %), the heavy one at the end (1.7 %).
+    """
     with np.load(shared_data / "swipe_40mm_s.npz") as file:
         force = file["lateral_force"][46000:69000].astype(float)
     texture = recorded(resample_poly(force - force.mean(), 2, 1))

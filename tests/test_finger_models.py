@@ -12,7 +12,7 @@ from hapticrender.analysis.models import FEWEST, LOAD_CLASSES
 from hapticrender.analysis.records import LOADED, FingerRecord, PlateTrack, Series
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_SECOND
 
-DRAWS = {2: 200, 4: 40}
+DRAWS = {2: 120, 4: 30}
 RARE = 1e-4  # probability of a false alarm of a bound
 FINGERS = {2: LIGHT_SECOND, 4: LIGHT}
 
@@ -65,7 +65,7 @@ def test_errors_of_the_plate_are_not_averaged_over_windows():
     assert (np.sqrt(np.mean(np.square(pulls["impedance"]), axis=0)) > 1.5).all()
 
 
-@pytest.mark.parametrize(("order", "draws"), [(2, 12), (4, 6)])
+@pytest.mark.parametrize(("order", "draws"), [(2, 8), (4, 4)])
 def test_the_data_choose_the_order(rng, order, draws):
     """A finger of the 2nd order seems one of the 4th where chi^2 of 3 parameters gains more than 3 ln N."""
     fits = [hr.fit_finger(make_impedance(rng, FINGERS[order], 6, (0.1, 0.49))) for _ in range(draws)]

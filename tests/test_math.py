@@ -7,26 +7,18 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.signal
-from naive_low_pass import NaiveLowPass
 
 from hapticrender import mathx
 from hapticrender.control.records import aligned
 from hapticrender.jit import kernel, record
-from hapticrender.vectors import W, get, pair, put, tile_type
+from hapticrender.vectors import W, get, put, tile_type
 
 RATE = 5000.0
 
 
 TILE = np.dtype([(name, float, (W,)) for name in ("x_re", "x_im", "y_re", "y_im")])
 TILE_T = tile_type(TILE)
-unit_of, smooth_of, polar_of = (
-    kernel(function)
-    for function in (
-        lambda b: put(b, "y", mathx.unit(get(b, "x_re"))),
-        lambda b: put(b, "y", mathx.smooth(get(b, "x_re"))),
-        lambda b: put(b, "y", pair(*mathx.polar(get(b, "x")))),
-    )
-)
+unit_of = kernel(lambda b: put(b, "y", mathx.unit(get(b, "x_re"))))
 
 
 @numba.njit
@@ -55,28 +47,6 @@ def test_sine_and_cosine_of_turns(rng):
     angle = 2 * np.longdouble(math.pi) * exact.astype(np.longdouble) + np.longdouble(2.4492935982947064e-16) * exact
     np.testing.assert_allclose(found.imag, np.sin(angle).astype(float), rtol=0, atol=3e-15)
     np.testing.assert_allclose(found.real, np.cos(angle).astype(float), rtol=0, atol=3e-15)
-
-
-def test_magnitude_and_angle_are_good_to_2e_10(rng):
-    """The interpolations err by 2.3e-10 rad and 1.8e-10 of the magnitude; the cut is at 90 degrees."""
-    points = 10.0 ** rng.uniform(-12, 3, 2000) * np.exp(2j * np.pi * rng.uniform(size=2000))
-    found = through(polar_of, points)
-    assert abs(found.real / abs(points) - 1.0).max() < 2e-10
-    assert abs(found.imag - NaiveLowPass.cut(points)).max() < 2.4e-10
-    nothing = through(polar_of, [0.0])[0]
-    assert nothing.real < 1e-140
-    assert abs(nothing.imag) < 2.4e-10
-
-
-def test_smoothstep_is_the_same_compiled_or_not():
-    x = np.linspace(-0.5, 1.5, 2001)
-    step = mathx.smoothstep(x)
-    np.testing.assert_allclose(through(smooth_of, x).real, step, rtol=0, atol=2**-51)
-    assert (step[x <= 0] == 0).all()
-    assert (step[x >= 1] == 1).all()
-    assert (np.diff(step) >= 0).all()
-    np.testing.assert_allclose(step + mathx.smoothstep(1 - x), 1.0, atol=2**-51)
-    assert mathx.smoothstep(0.25) == 0.15625
 
 
 @pytest.mark.parametrize(("period", "within"), [(1 / RATE, 1e-12), (2 / RATE, 1e-12), (0.05, 1e-9), (1.0, 1e-9)])

@@ -47,7 +47,7 @@ def test_the_panels_show_what_was_recorded():
     assert "misses its tolerance" in figure.axes[0].texts[-1].get_text()
 
 
-@pytest.mark.parametrize(("samples", "late"), [(0, 0.0), (1, 0.0), (60, 0.0), (10_000, np.nan), (10_000, 1e200)])
+@pytest.mark.parametrize(("samples", "late"), [(0, 0.0), (1, 0.0), (10_000, np.nan), (10_000, 1e200)])
 def test_the_shortest_runs_and_motions_that_are_no_numbers_are_drawn(tmp_path, samples, late):
     bands, scene = make_bands(100.0, 10 * UM), {"duration": max(samples / 5000, 1.0)}
     extra = np.where(times(samples / 5000) > 1.5, late, 0.0)[:, None]

@@ -83,7 +83,7 @@ def test_the_annotation_is_json_that_names_every_column(bands, signals, tmp_path
     assert (note["method"], note["seed"], note["drive_limit"]) == ("paper", 7, 3.0)
 
 
-@pytest.mark.parametrize("cut", [1, 120, 121])
+@pytest.mark.parametrize("cut", [1, 120])
 def test_a_frame_cut_short_is_left_out(bands, signals, tmp_path, cut):
     path = tmp_path / "run.au"
     with make_recorder(path, bands) as recorder:
@@ -149,25 +149,20 @@ def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
     assert len(Recording.load(path)) == 2500
 
 
-@pytest.mark.parametrize(("held", "refused"), [(b"notes of mine", True), (b".snd" + bytes(99), True), (b"", False)])
-def test_what_is_no_journal_is_not_replaced(bands, tmp_path, held, refused):
+@pytest.mark.parametrize("held", [b"notes of mine", b".snd" + bytes(99)])
+def test_what_is_no_journal_is_not_replaced(bands, tmp_path, held):
     path = tmp_path / "mine.au"
     path.write_bytes(held)
-    if refused:
-        with pytest.raises(
-            ValueError, match=r"mine\.au: is there and no recording of this library: choose another name"
-        ):
-            make_recorder(path, bands)
-        assert path.read_bytes() == held
-    else:
-        with make_recorder(path, bands) as recorder:
-            recorder.begin()
+    with pytest.raises(ValueError, match=r"mine\.au: is there and no recording of this library: choose another name"):
+        make_recorder(path, bands)
+    assert path.read_bytes() == held
 
 
-def test_a_damaged_or_older_journal_is_replaced(recording, bands, signals, tmp_path):
+@pytest.mark.parametrize("damage", [lambda whole: whole[:200].replace(b'"version": 2', b'"version": 1'), lambda _: b""])
+def test_an_empty_a_damaged_or_an_older_journal_is_replaced(recording, bands, signals, tmp_path, damage):
     path = tmp_path / "run.au"
     recording.save(path)
-    path.write_bytes(path.read_bytes()[:200].replace(b'"version": 2', b'"version": 1'))
+    path.write_bytes(damage(path.read_bytes()))
     with make_recorder(path, bands) as recorder:
         recorder.append(**signals)
     assert_same(recorder.finish(), recording)
@@ -202,14 +197,12 @@ def test_a_journal_that_is_the_texture_is_not_replaced(tmp_path):
 
 
 def test_a_new_run_leaves_an_open_recording_of_the_old_one_alone(bands, signals, tmp_path):
-    def run(count):
+    for count in (2500, 5):
         with make_recorder(tmp_path / "run.au", bands) as recorder:
             recorder.append(**{name: values[:count] for name, values in signals.items()})
-        return recorder.finish()
-
-    old = run(2500)
-    new = run(5)
-    assert (len(old), len(new)) == (2500, 5)
+        if count == 2500:
+            old = recorder.finish()
+    assert (len(old), len(recorder.finish())) == (2500, 5)
     np.testing.assert_array_equal(old.drive, signals["drive"])
 
 
@@ -237,12 +230,15 @@ def test_sound_files_hold_every_column_as_doubles(recording, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("verb", ["save", "load"])
-def test_an_unknown_suffix_lists_the_known_ones(recording, tmp_path, verb):
+def test_an_unknown_suffix_lists_the_known_ones_and_a_missing_folder_is_named(recording, tmp_path, verb):
     with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
         getattr(recording, verb)(tmp_path / "run.mp3")
     with pytest.raises(ValueError, match="a sound file cannot be loaded, because its rate is rounded"):
         Recording.load(tmp_path / "run.wav")
     assert list(tmp_path.iterdir()) == []
+    with pytest.raises(FileNotFoundError) as refused:
+        recording.save(tmp_path / "no" / "run.npz")
+    assert refused.value.filename == str(tmp_path / "no" / "run.npz")
 
 
 def test_hdf5_without_h5py_names_the_extra(recording, tmp_path, monkeypatch):
@@ -255,7 +251,7 @@ def test_hdf5_without_h5py_names_the_extra(recording, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
-@pytest.mark.parametrize("left", [0.0, 0.5, 0.999])
+@pytest.mark.parametrize("left", [0.0, 0.999])
 def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     if suffix == ".h5":
         pytest.importorskip("h5py", reason="HDF5 is an extra")
@@ -334,6 +330,7 @@ CHANGES = [
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
     ({"sensed_noise": [0.0, 1.0]}, "sensed_noise = (0.0, 1.0): must be one number, or one a place"),
     ({"version": 99}, "version = 99: must be 2"),
+    ({"format": "theirs"}, "(format = "),
     ({"colour": 1}, "colour = 1: unknown key"),
 ]
 
@@ -366,28 +363,7 @@ def test_no_header_makes_anything_but_a_header_or_a_value_error(recording, data)
     assert Header.from_json(header.to_json()).to_json() == header.to_json()
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"motion": np.zeros((5, 3))}, r"run\.npz: not a recording \(motion has shape"),
-        ({"drive": None}, r"run\.npz: not a recording \(.*drive"),
-        ({"header": np.array("{}")}, r"run\.npz: not a recording of this library \(format"),
-    ],
-)
-def test_signals_that_do_not_fit_their_header_are_refused_by_name(recording, tmp_path, changed, message):
-    signals = journal.split(recording.header, recording.frames) | {"header": np.array(recording.header.to_json())}
-    np.savez(tmp_path / "run.npz", **{name: value for name, value in (signals | changed).items() if value is not None})
-    with pytest.raises(ValueError, match=message):
-        Recording.load(tmp_path / "run.npz")
-
-
-def test_a_folder_that_is_missing_is_named_as_it_was_given(recording, tmp_path):
-    with pytest.raises(FileNotFoundError) as refused:
-        recording.save(tmp_path / "no" / "run.npz")
-    assert refused.value.filename == str(tmp_path / "no" / "run.npz")
-
-
-def test_files_that_would_grow_in_memory_are_refused(recording, tmp_path):
+def test_files_that_would_grow_in_memory_or_do_not_fit_their_header_are_refused(recording, tmp_path):
     h5py = pytest.importorskip("h5py", reason="HDF5 is an extra")
     header = recording.header.to_json()
     np.savez_compressed(tmp_path / "bomb.npz", header=np.array(header), drive=np.zeros((1_000_000, 2)))
@@ -401,8 +377,14 @@ def test_files_that_would_grow_in_memory_are_refused(recording, tmp_path):
     from scipy.io import savemat
 
     savemat(tmp_path / "bomb.mat", {"header": header, "drive": np.zeros((1_000_000, 2))}, do_compression=True)
-    for name, message in (("bomb.npz", "bytes, the file"), ("bomb.h5", "bytes, the file"), ("bomb.mat", "bytes, the")):
-        with pytest.raises(ValueError, match=f"{name}: not a recording .drive has .* {message}"):
+    signals = journal.split(recording.header, recording.frames) | {"header": np.array(header)}
+    np.savez(tmp_path / "shape.npz", **signals | {"motion": np.zeros((5, 3))})
+    for name, message in (
+        ("bomb.npz", "drive has .* bytes, the file"),
+        ("bomb.h5", "drive has .* bytes, the file"),
+        ("bomb.mat", "drive has .* bytes, the"),
+        ("link.h5", "drive: is missing, or no data set of this file"),
+        ("shape.npz", "motion has shape"),
+    ):
+        with pytest.raises(ValueError, match=f"{name}: not a recording .{message}"):
             Recording.load(tmp_path / name)
-    with pytest.raises(ValueError, match="drive: is missing, or no data set of this file"):
-        Recording.load(tmp_path / "link.h5")

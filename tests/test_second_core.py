@@ -48,11 +48,7 @@ def lines_of(script, cache, change=""):
 @two_cores
 @pytest.mark.parametrize(
     ("change", "ended"),
-    [
-        (AT_ONCE, True),
-        (AT_ONCE + "second_core.CODE = 'raise SystemExit(1)'", False),
-        (ENDLESS, False),
-    ],
+    [(AT_ONCE, True), (AT_ONCE + "second_core.CODE = 'raise SystemExit(1)'", False), (ENDLESS, False)],
     ids=["it works", "it fails", "it hangs"],
 )
 def test_what_a_child_does_not_compile_is_compiled_here(tmp_path, change, ended):

@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
-import numpy as np
 import pytest
 
 from hapticrender.errors import PlateMismatch
@@ -89,23 +88,21 @@ def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, op
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("r", "older")]
 
 
-def test_a_scene_that_cannot_be_sent_to_another_process_stops_no_other():
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
+    """One of them cannot be sent to another process."""
+
     class Local(Grating):
         """Known to this process only."""
 
-    found = validate([replace(SHORT, texture=Local(frequency=47.0, amplitude=10e-6), name="local"), SHORT], jobs=2)
-    assert [verdict.verdict for verdict in found] == ["error", "passed"]
-    assert "Can't pickle local object" in found[0].reason
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_bad_scene_stops_no_other(tmp_path, capsys, jobs):
+    local = replace(SHORT, texture=Local(frequency=47.0, amplitude=10e-6), name="plateless")
     bad = tmp_path / "bad.toml"
     bad.write_text(SHORT.to_toml().replace("47.0", "-47.0"))
-    plate = replace(SHORT, device="no-such-plate", name="plateless")
+    plate = replace(SHORT, device="no-such-plate", name="plateless") if jobs == 1 else local
     found = validate([bad, SHORT, plate, SLOW], jobs=jobs, progress=sys.stderr)
     assert [verdict.verdict for verdict in found] == ["error", "passed", "error", "not judged"]
     assert "texture.frequency = -47.0" in found[0].reason
+    assert ("no-such-plate" if jobs == 1 else "Can't pickle local object") in found[2].reason
     assert found[3].reason.startswith("the texture has nothing from 20 to 500 Hz")
     assert exit_status(found) == 2
     assert [exit_status(found[1:2] + found[3:], strict=strict) for strict in (False, True)] == [0, 1]
@@ -218,14 +215,12 @@ HEAVY = Scene(texture=Grating(amplitude=10e-6, frequency=120.0), duration=2.0, n
 
 
 def test_a_mismatch_that_is_raised_as_an_error_holds_the_recording():
-    with pytest.warns(PlateMismatch, match="the device differs"):
-        expected = render(HEAVY)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         with pytest.raises(PlateMismatch, match="the device differs") as raised:
             render(HEAVY)
-    np.testing.assert_array_equal(raised.value.recording.drive, expected.drive)
-    assert (str(raised.value),) == raised.value.recording.warnings == expected.warnings
+    assert len(raised.value.recording) == 2.0 * raised.value.recording.rate
+    assert (str(raised.value),) == raised.value.recording.warnings
 
 
 def test_a_mismatch_is_a_warning_in_every_report_and_stops_no_scene(tmp_path):

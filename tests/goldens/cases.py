@@ -30,30 +30,10 @@ DEFAULT_METHOD = "h2"
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One scene, by one method, on one simulated device.
-
-    Parameters
-    ----------
-    name : str
-    device : str
-        Kind of the device.
-    method : str
-        Name of the control method.
-    texture, finger, simulated, believed, fault : mapping
-        See the tables above.
-    duration : float, s
-    settle : float, s
-        Figures are taken from here on.
-    window : float, s
-        Length of the consecutive windows in which envelopes are fitted.
-    block : int, samples
-        That the device takes and gives at a time.
-    seed : int
-        Of the sensor noise.
-    """
+    """One scene, by one method, on one simulated device; the tables are those above."""
 
     name: str
-    device: str = "vt-plate"
+    device: str = "vt-plate"  # kind
     method: str = DEFAULT_METHOD
     texture: Table
     finger: Table = field(default_factory=lambda: {"motion": "none"})
@@ -61,10 +41,10 @@ class Case:
     believed: Table | None = None
     fault: Table | None = None
     duration: float = 1.0
-    settle: float = 0.3
-    window: float = 0.02
-    block: int = 1
-    seed: int = 0
+    settle: float = 0.3  # s: figures are taken from here on
+    window: float = 0.02  # s: length of the consecutive windows in which envelopes are fitted
+    block: int = 1  # samples that the device takes and gives at a time
+    seed: int = 0  # of the sensor noise
 
 
 def tone(frequency: float, amplitude: float) -> Table:
@@ -121,109 +101,44 @@ PLATE = (
     Case(name="plate-free", texture=tone(189.0, 50e-6), simulated=IDEAL, duration=0.6),
     Case(name="plate-touch-lift", texture=tone(143.0, 50e-6), finger=PRESSING, simulated=IDEAL, duration=1.2),
     Case(name="plate-slide", texture=tone(178.0, 50e-6), finger=SLIDING, simulated=IDEAL, duration=1.4, settle=0.1),
-    Case(
-        name="plate-reversal",
-        texture={"kind": "grating", "wavelength": 0.5e-3, "amplitude": 10e-6},
-        finger=SWIPING,
-        simulated=IDEAL,
-        duration=1.2,
-    ),
-    Case(
-        name="plate-sweep",
-        texture={"kind": "grating", "wavelength": 1e-6, "amplitude": 50e-6},
-        finger=SWEEP,
-        simulated=IDEAL,
-        duration=0.75,
-    ),
+    Case(name="plate-reversal", texture={"kind": "grating", "wavelength": 0.5e-3, "amplitude": 10e-6}, finger=SWIPING,
+         simulated=IDEAL, duration=1.2),
+    Case(name="plate-sweep", texture={"kind": "grating", "wavelength": 1e-6, "amplitude": 50e-6}, finger=SWEEP,
+         simulated=IDEAL, duration=0.75),
     Case(name="plate-comb", texture=COMB, finger=SLIDING, duration=1.5, settle=0.7, window=0.1),
-    Case(
-        name="plate-press",
-        texture=tone(60.0, 5e-6),
-        finger={**HEAVY, "motion": "still", "at": -1e-2, "normal_load": ((0.0, 0.5, 0.501), (0.1, 0.1, 0.6))},
-        simulated=IDEAL,
-        window=0.04,
-    ),
-    Case(
-        name="plate-saturation",
-        texture=tone(250.0, 100e-6),
-        finger=PRESSING,
-        simulated={**IDEAL, "current_limit": 0.36},
-        duration=1.2,
-    ),
-    Case(
-        name="plate-nan-sensor",
-        texture=tone(111.0, 50e-6),
-        finger={**SLIDING, **LIGHT},
-        simulated=IDEAL,
-        fault={"kind": "nan", "channel": 0, "start": 0.5, "stop": 0.52},
-    ),
-    Case(
-        name="plate-frozen-sensor",
-        texture=tone(111.0, 50e-6),
-        simulated=IDEAL,
-        fault={"kind": "frozen", "channel": 1, "start": 0.5, "stop": 0.56},
-    ),
-    Case(
-        name="plate-wrong",
-        texture=tone(170.0, 50e-6),
-        finger=SLIDING,
-        simulated=WRONG,
-        believed={},
-        duration=1.4,
-        settle=0.1,
-    ),
-    Case(
-        name="plate-block-25",
-        texture=tone(143.0, 50e-6),
-        finger=SLIDING,
-        simulated={**IDEAL, "delay": 25},
-        block=25,
-        duration=1.4,
-        settle=0.1,
-    ),
-    Case(
-        name="plate-block-64",
-        texture=tone(178.0, 50e-6),
-        finger=PRESSING,
-        simulated={**IDEAL, "rate": 48e3, "delay": 64},
-        block=64,
-        duration=1.2,
-    ),
+    Case(name="plate-press", texture=tone(60.0, 5e-6),
+         finger={**HEAVY, "motion": "still", "at": -1e-2, "normal_load": ((0.0, 0.5, 0.501), (0.1, 0.1, 0.6))},
+         simulated=IDEAL, window=0.04),
+    Case(name="plate-saturation", texture=tone(250.0, 100e-6), finger=PRESSING,
+         simulated={**IDEAL, "current_limit": 0.36}, duration=1.2),
+    Case(name="plate-nan-sensor", texture=tone(111.0, 50e-6), finger={**SLIDING, **LIGHT}, simulated=IDEAL,
+         fault={"kind": "nan", "channel": 0, "start": 0.5, "stop": 0.52}),
+    Case(name="plate-frozen-sensor", texture=tone(111.0, 50e-6), simulated=IDEAL,
+         fault={"kind": "frozen", "channel": 1, "start": 0.5, "stop": 0.56}),
+    Case(name="plate-wrong", texture=tone(170.0, 50e-6), finger=SLIDING, simulated=WRONG, believed={}, duration=1.4,
+         settle=0.1),
+    Case(name="plate-block-25", texture=tone(143.0, 50e-6), finger=SLIDING, simulated={**IDEAL, "delay": 25},
+         block=25, duration=1.4, settle=0.1),
+    Case(name="plate-block-64", texture=tone(178.0, 50e-6), finger=PRESSING,
+         simulated={**IDEAL, "rate": 48e3, "delay": 64}, block=64, duration=1.2),
     Case(name="plate-waveform", texture=RECORDED, finger=SLIDING, simulated=IDEAL, duration=1.4, window=0.05),
     Case(name="plate-modulated", texture=MODULATED, simulated=IDEAL),
-    Case(
-        name="plate-one-coil",
-        texture=tone(111.0, 50e-6),
-        finger={**LIGHT, "motion": "still", "touches": ((0.4, 0.8),)},
-        simulated={**IDEAL, "coils": 1},
-    ),
-)
+    Case(name="plate-one-coil", texture=tone(111.0, 50e-6),
+         finger={**LIGHT, "motion": "still", "touches": ((0.4, 0.8),)}, simulated={**IDEAL, "coils": 1}),
+)  # fmt: skip
 OTHER_DEVICES = (
-    Case(
-        name="electroadhesion-slide",
-        device="electroadhesion",
-        texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3),
-        finger={**STROKING, "touches": ((0.0, 0.6), (0.7, 10.0))},
-        simulated={"area_scale": 1.2, "gap_thickness": 1e-6},
-        window=0.04,
-    ),
-    Case(
-        name="electroadhesion-impedance",
-        device="electroadhesion",
-        texture=SPATIAL,
-        finger=SWIPING,
-        simulated={"sensor": "impedance", "level": "carrier"},
-    ),
-    Case(
-        name="ultrasonic-touch",
-        device="ultrasonic",
-        texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3),
-        finger={**STROKING, "touches": ((0.0, 0.4), (0.5, 10.0))},
-        simulated={"temperature_rise": 10.0, "temperature_time": 0.5, "sensor_bits": 0, "drive_bits": 0},
-        window=0.04,
-    ),
-    Case(name="hybrid-slide", device="hybrid", texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3), finger=STROKING,
-         simulated=IDEAL, window=0.04),
+    Case(name="electroadhesion-slide", device="electroadhesion",
+         texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3),
+         finger={**STROKING, "touches": ((0.0, 0.6), (0.7, 10.0))},
+         simulated={"area_scale": 1.2, "gap_thickness": 1e-6}, window=0.04),
+    Case(name="electroadhesion-impedance", device="electroadhesion", texture=SPATIAL, finger=SWIPING,
+         simulated={"sensor": "impedance", "level": "carrier"}),
+    Case(name="ultrasonic-touch", device="ultrasonic", texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3),
+         finger={**STROKING, "touches": ((0.0, 0.4), (0.5, 10.0))},
+         simulated={"temperature_rise": 10.0, "temperature_time": 0.5, "sensor_bits": 0, "drive_bits": 0},
+         window=0.04),
+    Case(name="hybrid-slide", device="hybrid", texture=partials(50.0, (1.0, 2.4, 5.0), velocity=5e-3),
+         finger=STROKING, simulated=IDEAL, window=0.04),
 )  # fmt: skip
 BASELINES = (
     Case(name="paper-free", method="paper", texture=tone(47.0, 50e-6), simulated=IDEAL, duration=1.2, window=0.05,

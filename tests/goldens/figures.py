@@ -12,55 +12,33 @@ FAILS = 0.1  # relative error from which a method fails: below it no difference 
 
 @dataclass(frozen=True, kw_only=True)
 class Played:
-    """Signals of a run on one clock; the first column of `motion` is the centre.
-
-    Parameters
-    ----------
-    rate : float, Hz
-    frequency, wavenumber, phase : ndarray, shape (bands,), Hz, 1/m, rad
-        Carriers ``cos(2 pi (frequency t + wavenumber x) + phase)``.
-    drive : ndarray, shape (n, channels)
-    motion : ndarray, shape (n, places)
-        True motion, or friction, or skin velocity.
-    position : ndarray, shape (n,), m
-        Of the finger, NaN while it is lifted.
-    target : ndarray of complex, shape (n, bands)
-    flags : dict of str to ndarray of bool, shape (n,)
-    """
+    """Signals of n samples; carriers are ``cos(2 pi (frequency t + wavenumber x) + phase)``."""
 
     rate: float
-    frequency: np.ndarray
+    frequency: np.ndarray  # Hz, (bands,), as wavenumber (1/m) and phase (rad)
     wavenumber: np.ndarray
     phase: np.ndarray
-    drive: np.ndarray
-    motion: np.ndarray
-    position: np.ndarray
-    target: np.ndarray
-    flags: dict[str, np.ndarray]
+    drive: np.ndarray  # (n, channels)
+    motion: np.ndarray  # (n, places), the centre first: true motion, or friction, or skin velocity
+    position: np.ndarray  # m, (n,), NaN while the finger is lifted
+    target: np.ndarray  # complex, (n, bands)
+    flags: dict[str, np.ndarray]  # bool, (n,)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Envelopes:
-    """Envelopes in consecutive windows.
+    """Envelopes in w consecutive windows.
 
-    Parameters
-    ----------
-    time : ndarray, shape (w,), s
-        Start of each window.
-    wanted : ndarray of complex, shape (w, bands)
-    achieved : ndarray of complex, shape (w, places, bands)
-    judged : ndarray of bool, shape (w, bands)
-        The window tells the carrier from its neighbours and from an offset, and something is wanted all through it.
-    residual : ndarray, shape (w,)
-        Mean square of the centre's motion that neither carriers nor an offset and a slope explain, and that is no
-        multiple of what they leave of the wanted waveform.
+    `judged`: the window separates the carrier from its neighbours and an offset, and something is wanted all through
+    it.  `residual`: mean square of the centre's motion that neither carriers nor an offset and a slope explain, and
+    that is no multiple of what they leave of the wanted waveform.
     """
 
-    time: np.ndarray
-    wanted: np.ndarray
-    achieved: np.ndarray
-    judged: np.ndarray
-    residual: np.ndarray
+    time: np.ndarray  # s, (w,): start of each window
+    wanted: np.ndarray  # complex, (w, bands)
+    achieved: np.ndarray  # complex, (w, places, bands)
+    judged: np.ndarray  # bool, (w, bands)
+    residual: np.ndarray  # (w,)
 
 
 def turns_of(played: Played) -> np.ndarray:
@@ -173,9 +151,3 @@ def drive_of(played: Played) -> np.ndarray:
     """Drive at the start, in the middle and at the end of a run, shape (3, SEGMENT, channels)."""
     n = len(played.drive)
     return np.stack([played.drive[at : at + SEGMENT] for at in (0, (n - SEGMENT) // 2, n - SEGMENT)])
-
-
-def amplitudes_of(played: Played, window: float) -> np.ndarray:
-    """Amplitudes (w, places, bands) of the true motion, NaN where they are not judged."""
-    found = envelopes(played, window)
-    return np.where(found.judged[:, None], abs(found.achieved), np.nan).astype(np.float32)

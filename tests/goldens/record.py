@@ -1,6 +1,6 @@
 """Record the goldens: ``python tests/goldens/record.py [--commit HASH]``, from the root of a checkout.
 
-Writes ``goldens.npz`` (amplitudes in float32, three segments of drive in float64, a case each) and ``figures.json``
+Writes ``goldens.npz`` (three segments of drive of every case) and ``figures.json``
 (figures and flags of every case, and the spread of each figure over `SEEDS`).  Recording anew means that what must not
 change has changed: say why in the commit.
 """
@@ -42,7 +42,7 @@ def main() -> None:
 
 
 def record(case: Case) -> tuple[dict, dict[str, np.ndarray]]:
-    """Figures, their spread and flags of a case; its amplitudes and drive."""
+    """Figures, their spread and flags of a case; its drive."""
     played = play(case)
     figures = judge.figures(played, case.window, case.settle)
     others = [judge.figures(play(replace(case, seed=seed)), case.window, case.settle) for seed in SEEDS]
@@ -52,7 +52,7 @@ def record(case: Case) -> tuple[dict, dict[str, np.ndarray]]:
         "spread": {key: spread([other[key] for other in others]) for key in figures},
         "flags": judge.flags(played),
     }
-    return told, {"amplitude": judge.amplitudes_of(played, case.window), "drive": judge.drive_of(played)}
+    return told, {"drive": judge.drive_of(played)}
 
 
 def spread(values: list[float | None]) -> float | None:
