@@ -42,11 +42,11 @@ _HOMES = {
     "touch.grating": "Grating",
     "touch.latency_budget": "finest_wavelength phase_error",
     "touch.mechanics": "FingerMechanics",
-    "touch.motion": "Sampled TriangleMotion Still SineMotion RecordedMotion",
+    "touch.motion": "Sampled TriangleMotion Still SineMotion",
     "touch.motion_estimator": "Encoder MotionEstimator",
     "touch.perception": "detection_threshold roughness sensation_level",
     "touch.curve": "strongest_carriers",
-    "touch.recorded": "Recorded Swipe Synthetic",
+    "touch.recorded": "Recorded Synthetic",
     "touch.scene": "Scene",
     "touch.touch_panel": "TouchPanel",
 }
@@ -103,7 +103,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.latency_budget import finest_wavelength as finest_wavelength
     from hapticrender.touch.latency_budget import phase_error as phase_error
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics
-    from hapticrender.touch.motion import RecordedMotion as RecordedMotion
     from hapticrender.touch.motion import Sampled as Sampled
     from hapticrender.touch.motion import SineMotion as SineMotion
     from hapticrender.touch.motion import Still as Still
@@ -114,7 +113,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
     from hapticrender.touch.recorded import Recorded as Recorded
-    from hapticrender.touch.recorded import Swipe as Swipe
     from hapticrender.touch.recorded import Synthetic as Synthetic
     from hapticrender.touch.scene import Scene as Scene
     from hapticrender.touch.touch_panel import TouchPanel as TouchPanel
