@@ -155,7 +155,6 @@ def loads() -> Item:
                (Curve("mean of the subjects", law.frequency, share, "o"),), "x", (0, 1))),
         "The simulated impedance grows with the load at all frequencies; that a participant's does so from 111 Hz on "
         "only needs participants. R² is lower where the noise is larger beside the impedance.",
-        picture=partial(pictures.draw_load, records),
     )  # fmt: skip
 
 

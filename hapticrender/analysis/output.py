@@ -136,7 +136,7 @@ above the threshold (loaded); grey spans are below it (unloaded), orange ones ne
 {_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits", "too few bands")}
 {_fits(fits)}</section>
 <section><h2>Impedance over the load</h2>
-{_picture("load.png", pictures, "Impedance over load, share explained by the load", ONE_LOAD)}</section>
+{_picture("load.png", pictures, "Impedance over load", ONE_LOAD)}</section>
 {times}"""
     return html_page(f"The finger, measured: {title}", body)
 
