@@ -40,12 +40,12 @@ def summary(recording: Recording) -> dict[str, Any]:
     all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
-    mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
-    |X - target| at the first place over the same, `phase_error` the lead of the mean there.
+    mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `phase_error` the lead of the mean
+    at the first place.
 
     `wobble` (m) is the rms of the narrowband motion at the first place that is no multiple of its target: the root of
     sum_k mean |X_k - c_k target_k|^2 / 2 with c_k by least squares; a window of 2 periods passes variations up to about
-    0.44/window.  `residual_rms` (m) is the rms of all other motion there, see `Envelopes.residual`.
+    0.44/window.
 
     `frequency` of a finger-locked band is the median while it is judged.  `settling_time` is None unless the band stays
     within 5 % of its target, in amplitude and phase, for the last 0.5 s, or 10 % of the judged time where shorter.
@@ -58,7 +58,6 @@ def summary(recording: Recording) -> dict[str, Any]:
     worst, misses, noise = _worst(recording)
     verdict, reason = _verdict(recording, worst, misses, noise)
     flags = _flag_counts(recording)
-    residual = _mean(envelopes.residual[settled & envelopes.finite])
     names = ("device", "method", "seed", "unit", "rate", "tolerance", "motion_source")
     return {
         "scene": header.name,
@@ -72,7 +71,6 @@ def summary(recording: Recording) -> dict[str, Any]:
         "waveform": recording.waveform,
         "bands": bands,
         "wobble": _wobble(envelopes, judged),
-        "residual_rms": math.sqrt(residual) if residual is not None and math.isfinite(residual) else None,
         "saturated_share": flags[Flag.SATURATED] / max(1, len(recording)),
         "flags": {str(flag.name): count for flag, count in flags.items() if count},
         "notes": _notes(recording, bands, settled, flags[Flag.TWO_TOUCHES]),
@@ -90,14 +88,13 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     lead = achieved[:, 0] * target.conj()
     lead = np.where(envelopes.backward[judged, k], lead.conj(), lead)  # a lead stays a lead on the way back
     some = bool(judged.any())
-    mean, size = _mean(np.abs(target)), np.sqrt(np.mean(np.abs(target) ** 2)) if some else 0.0
+    mean = _mean(np.abs(target))
     frequency = envelopes.frequency[judged, k]
     figures: dict[str, Any] = {
         "frequency": float(bands.frequency[k]) if not wavenumber else float(np.median(frequency)) if some else None,
         "wavelength": 1 / wavenumber if wavenumber else None,
         "target": mean,
         "achieved": _mean(np.abs(achieved[:, 0])),
-        "complex_error": float(np.sqrt(np.mean(np.abs(achieved[:, 0] - target) ** 2)) / size) if size else None,
         "phase_error": float(np.angle(lead.mean())) if some else None,
         "settling_time": _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_seconds)),
         "judged_windows": int(judged.sum()),
