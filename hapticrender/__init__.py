@@ -46,7 +46,7 @@ _HOMES = {
     "touch.motion_estimator": "Encoder MotionEstimator",
     "touch.perception": "detection_threshold roughness sensation_level",
     "touch.curve": "strongest_carriers",
-    "touch.recorded": "Recorded Synthetic",
+    "touch.recorded": "Recorded",
     "touch.scene": "Scene",
     "touch.touch_panel": "TouchPanel",
 }
@@ -113,7 +113,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
     from hapticrender.touch.recorded import Recorded as Recorded
-    from hapticrender.touch.recorded import Synthetic as Synthetic
     from hapticrender.touch.scene import Scene as Scene
     from hapticrender.touch.touch_panel import TouchPanel as TouchPanel
 

@@ -1,4 +1,4 @@
-"""Recorded textures: sound files, and the synthetic one."""
+"""Recorded textures: samples and sound files."""
 
 import os
 
@@ -8,7 +8,7 @@ import soundfile
 
 from hapticrender.errors import SceneError
 from hapticrender.touch import recorded
-from hapticrender.touch.recorded import Recorded, Synthetic
+from hapticrender.touch.recorded import Recorded
 
 
 def tone(frequency, rate, seconds=2.0):
@@ -149,14 +149,3 @@ def test_what_is_no_sound_file_is_refused(tmp_path):
     for name, message in [("text.wav", "readable"), ("absent.wav", "existing"), (".", "existing")]:
         with pytest.raises(SceneError, match=f"^file = .*: must be an? {message} sound file"):
             Recorded(file=tmp_path / name, amplitude=1e-6).check()
-
-
-@pytest.mark.parametrize(("components", "seed"), [(1, 0), (3, 0), (8, 1), (8, 2**32 - 1)])
-def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
-    texture = Synthetic(amplitude=10e-6, components=components, seed=seed, carriers=components)
-    frequency = texture.bands(5000.0).frequency
-    assert len(frequency) == components
-    assert np.diff(frequency, prepend=-10.0).min() >= 40.0 - 1e-9
-    assert frequency.max() <= 400.0
-    time = np.arange(0, 5, 1 / 5000)
-    assert np.abs(texture.waveform(time, time)).max() <= 10e-6

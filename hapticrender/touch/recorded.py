@@ -1,8 +1,8 @@
-"""Recorded textures: samples, a sound file, and a synthetic one that needs no file."""
+"""Recorded textures: samples, or a sound file."""
 
 import re
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -206,70 +206,3 @@ def _header_problem(sound: Any, channel: int) -> str:
     if not 1 <= sound.samplerate <= MOST_RATE:
         return f"has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz"
     return "" if channel < channels else f"channel = {channel}: must be < {channels}, its number of channels"
-
-
-DEPTH = 0.5  # of the slow modulation
-LEAST_GAP = 40.0  # Hz
-
-
-@dataclass(frozen=True, kw_only=True)
-class Synthetic(Validated, Composable):
-    """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
-
-    Without a speed it is over time.
-
-    Examples
-    --------
-    >>> Synthetic(amplitude=10e-6, components=3, carriers=3).bands(rate=5000.0).frequency.round(1).tolist()
-    [42.7, 210.4, 380.8]
-    """
-
-    kind: ClassVar[str] = "synthetic"
-
-    amplitude: float = parameter(unit="m", about="bound of their sum, never exceeded", above=0, most=MOST_AMPLITUDE)
-    speed: float | None = parameter(None, "m/s", "at which they lie at 30 to 400 Hz", above=1e-6, most=MOST_SPEED)
-    components: int = parameter(6, about="how many, at least 40 Hz apart", least=1, most=8)
-    seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
-    carriers: int | None = parameter(None, about="of its strongest components; None: played whole", least=1, most=8)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        bound = f"at most components = {self.components}"
-        require((self.carriers or 1) <= self.components, "carriers", self.carriers, bound)
-
-    @property
-    def spatial(self) -> bool:
-        """Whether it is read at the finger's position."""
-        return self.speed is not None
-
-    def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest components (below rate/2, `rate` in Hz); envelopes are to be analysed.
-
-        None without `carriers`: the whole waveform is played.
-        """
-        if self.carriers is None:
-            return Bands.none(spatial=self.spatial)
-        frequency, weight = _draw(self.components, self.seed)[:2]
-        return _carriers(frequency[np.sort(np.argsort(-weight)[: self.carriers])], self.speed, rate)
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Target displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""
-        recorded = np.asarray(time, float) if self.speed is None else np.asarray(position, float) / self.speed
-        total = np.zeros(recorded.shape)
-        for frequency, weight, swell, phase, start in _draw(self.components, self.seed).T:
-            envelope = weight * (1 + DEPTH * np.cos(2 * np.pi * (swell * recorded + start)))
-            total += envelope * np.cos(2 * np.pi * (frequency * recorded + phase))
-        return np.where(np.isfinite(recorded), self.amplitude * total, 0.0)
-
-
-@lru_cache(maxsize=16)
-def _draw(components: int, seed: int) -> Array:
-    """Per component: frequency (Hz), weight (1), frequency of its modulation (Hz), and two phases (turns)."""
-    rng = np.random.default_rng(seed)
-    middle = np.linspace(40.0, 390.0, components) if components > 1 else np.array([200.0])
-    gap = 350.0 / max(components - 1, 1)
-    jitter = min(10.0, (gap - LEAST_GAP) / 2)
-    frequency = middle + rng.uniform(-jitter, jitter, components)
-    weight = rng.uniform(0.4, 1.0, components)
-    weight /= weight.sum() * (1 + DEPTH)
-    return np.stack([frequency, weight, rng.uniform(0.2, 0.8, components), *rng.uniform(0, 1, (2, components))])

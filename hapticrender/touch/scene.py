@@ -22,7 +22,7 @@ from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
 from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, SineMotion, Still, TriangleMotion
-from hapticrender.touch.recorded import Recorded, Synthetic
+from hapticrender.touch.recorded import Recorded
 from hapticrender.touch.touch_panel import TouchPanel
 
 LONGEST_LINE = 500  # characters
@@ -48,7 +48,7 @@ class Custom(Validated):
 
 
 Kinds = dict[str, type[Any]]
-TEXTURES: Kinds = {one.kind: one for one in (Grating, Recorded, Synthetic, Chirp, Sum, Playlist, Custom)}
+TEXTURES: Kinds = {one.kind: one for one in (Grating, Recorded, Chirp, Sum, Playlist, Custom)}
 MOTIONS: Kinds = {one.kind: one for one in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, Custom)}
 TABLES = {  # field of a scene: table of a file
     "profile": "device",
