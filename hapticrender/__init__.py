@@ -24,8 +24,7 @@ _HOMES = {
     "analysis.analyse": "analyse_finger",
     "analysis.records": "FingerRecord",
     "analysis.tracker": "FingerTracker",
-    "analysis.load_law": "load_exponent",
-    "analysis.models": "fit_finger fit_load_classes",
+    "analysis.models": "fit_finger",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
@@ -56,9 +55,7 @@ __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
     from hapticrender.analysis.analyse import analyse_finger as analyse_finger
-    from hapticrender.analysis.load_law import load_exponent as load_exponent
     from hapticrender.analysis.models import fit_finger as fit_finger
-    from hapticrender.analysis.models import fit_load_classes as fit_load_classes
     from hapticrender.analysis.records import FingerRecord as FingerRecord
     from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.bands import Bands as Bands

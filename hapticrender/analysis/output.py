@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import weighted_mean
-from hapticrender.analysis.models import UNITS, FingerFit
+from hapticrender.analysis.models import UNITS, FingerFit, weighted_mean
 from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
 from hapticrender.formatting import as_json, table
 from hapticrender.protocols import Array

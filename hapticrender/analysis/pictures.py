@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import Samples, load_exponent, weighted_mean
-from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
+from hapticrender.analysis.models import FEWEST, LOAD_CLASSES, FingerFit, Samples, fit_finger, weighted_mean
 from hapticrender.analysis.output import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
 from hapticrender.protocols import Array
@@ -43,7 +42,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     fits = fit_all(records)
     drawn: dict[str, Any] = {f"time-{i}.png": partial(draw_time, each) for i, each in enumerate(records, 1)}
     if Samples.of(records).loads_differ:
-        drawn["load.png"] = partial(draw_load, records)
+        drawn["load.png"] = partial(draw_load, records, fits)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
     try:
@@ -60,11 +59,12 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
 def fit_all(records: Sequence[FingerRecord]) -> Fits:
     """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
     found: Fits = {}
-    for name, fit in fit_load_classes(records).items():
-        found[name] = {fit.order: fit}
-        if isfinite(fit.bic_margin):
-            other = 6 - fit.order
-            found[name][other] = fit_finger(records, other, loads=LOAD_CLASSES[name])
+    for name, loads in LOAD_CLASSES.items():
+        if Samples.of(records, loads).carriers >= FEWEST[2]:
+            fit = fit_finger(records, loads=loads)
+            found[name] = {fit.order: fit}
+            if isfinite(fit.bic_margin):
+                found[name][6 - fit.order] = fit_finger(records, 6 - fit.order, loads=loads)
     return found
 
 
@@ -82,18 +82,19 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
         save(figure, path)
 
 
-def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
-    """Draw the impedance over the load: windows as dots, and a fitted power a frequency."""
-    law, bins = load_exponent(records), Samples.of(records).by_frequency()
+def draw_load(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
+    """Draw the impedance over the load: windows as dots, the better fit of each class of loads as lines."""
+    bins = Samples.of(records).by_frequency()
     chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
     with new_figure((7, 4.2), pads=(0.1, 0.05)) as figure:
         axes = figure.subplots()
         for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
-            at = int(np.argmin(np.abs(law.frequency - np.median(samples.frequency))))
-            axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5)
-            reach = np.array([samples.load.min(), samples.load.max()])
-            line = law.magnitude[at] * (reach / law.reference_load[at]) ** law.exponent[at]
-            axes.plot(reach, line, color=colour, lw=1.6, label=f"{law.frequency[at]:.0f} Hz")
+            frequency = np.median(samples.frequency)
+            label = f"{frequency:.0f} Hz"
+            axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5, label=label)
+            for fit in (next(iter(each.values())) for each in fits.values()):
+                lines = [abs(fit.impedance(np.array([frequency]), load)[0]) for load in fit.loads]
+                axes.plot(fit.loads, lines, color=colour, lw=1.6)
         axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", yscale="log")
         _numbers(axes.yaxis)
         if np.ptp(np.log(np.concatenate([each.load for each in bins]))) > 1:
