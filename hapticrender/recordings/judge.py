@@ -26,29 +26,23 @@ UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": 
 
 @np.errstate(**DIVERGING)
 def summary(recording: Recording) -> dict[str, Any]:
-    """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure.
+    """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure (docs/theory.md, section 7).
 
-    The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
-    scene specifies it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
-    rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of 100
-    ms, and the worst `third_octave_error` (on a plate up to 1000 Hz) are within twice the tolerance, and no sample is
-    flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20
-    to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said, or the
-    run was cut off before a figure failed, and no sample is flagged.  `worst` is the figure furthest over its `bound`;
-    `reason` states what else decided.  See ``waveform_figures`` for the equations.  `contacts` are the errors after
-    touches and lifts; `delay` (s), `gain` and `incoherent` share state how y differs from r and decide nothing, like
-    all that follows.
+    `verdict` is "passed", "passed in band" (part of the texture's energy cannot be played), "failed" or "not judged";
+    it rests on `waveform_error`, `window_error` and `third_octave_error` at every place in `waveform`, and on flags.
+    `worst` is the figure furthest over its `bound`; `reason` states what else decided.  `contacts` are the errors after
+    touches and lifts; `delay` (s), `gain` and `incoherent` share state how the motion differs from the reference and
+    decide nothing, like all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
     mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `phase_error` the lead of the mean
-    at the first place.
+    at the first place.  `frequency` of a finger-locked band is the median while it is judged.  `settling_time` is None
+    unless the band stays within 5 % of its target, in amplitude and phase, for the last 0.5 s, or 10 % of the judged
+    time where shorter.
 
     `wobble` (m) is the rms of the narrowband motion at the first place that is no multiple of its target: the root of
     sum_k mean |X_k - c_k target_k|^2 / 2 with c_k by least squares; a window of 2 periods passes variations up to about
     0.44/window.
-
-    `frequency` of a finger-locked band is the median while it is judged.  `settling_time` is None unless the band stays
-    within 5 % of its target, in amplitude and phase, for the last 0.5 s, or 10 % of the judged time where shorter.
     """
     header, places = recording.header, [place.replace(" ", "_") for place in recording.header.places]
     envelopes, begin = recording.envelopes, judged_from(recording)
