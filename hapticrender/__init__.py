@@ -24,8 +24,7 @@ _HOMES = {
     "analysis.analyse": "analyse_finger",
     "analysis.records": "FingerRecord",
     "analysis.tracker": "FingerTracker",
-    "analysis.load_law": "load_exponent",
-    "analysis.models": "fit_finger fit_load_classes",
+    "analysis.models": "fit_finger",
     "bands": "Bands",
     "control.demodulator": "Demodulator",
     "errors": "DesignError DeviceFault DeviceLost DeviceNotFound DeviceTimeout DriverError HapticError PlateMismatch "
@@ -42,11 +41,11 @@ _HOMES = {
     "touch.grating": "Grating",
     "touch.latency_budget": "finest_wavelength phase_error",
     "touch.mechanics": "FingerMechanics",
-    "touch.motion": "Sampled TriangleMotion Still SineMotion RecordedMotion",
+    "touch.motion": "Sampled TriangleMotion Still SineMotion",
     "touch.motion_estimator": "Encoder MotionEstimator",
     "touch.perception": "detection_threshold roughness sensation_level",
     "touch.curve": "strongest_carriers",
-    "touch.recorded": "Recorded Swipe Synthetic",
+    "touch.recorded": "Recorded",
     "touch.scene": "Scene",
     "touch.touch_panel": "TouchPanel",
 }
@@ -56,9 +55,7 @@ __all__ = sorted(_HOME_OF)
 
 if _typing.TYPE_CHECKING:
     from hapticrender.analysis.analyse import analyse_finger as analyse_finger
-    from hapticrender.analysis.load_law import load_exponent as load_exponent
     from hapticrender.analysis.models import fit_finger as fit_finger
-    from hapticrender.analysis.models import fit_load_classes as fit_load_classes
     from hapticrender.analysis.records import FingerRecord as FingerRecord
     from hapticrender.analysis.tracker import FingerTracker as FingerTracker
     from hapticrender.bands import Bands as Bands
@@ -103,7 +100,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.latency_budget import finest_wavelength as finest_wavelength
     from hapticrender.touch.latency_budget import phase_error as phase_error
     from hapticrender.touch.mechanics import FingerMechanics as FingerMechanics
-    from hapticrender.touch.motion import RecordedMotion as RecordedMotion
     from hapticrender.touch.motion import Sampled as Sampled
     from hapticrender.touch.motion import SineMotion as SineMotion
     from hapticrender.touch.motion import Still as Still
@@ -114,8 +110,6 @@ if _typing.TYPE_CHECKING:
     from hapticrender.touch.perception import roughness as roughness
     from hapticrender.touch.perception import sensation_level as sensation_level
     from hapticrender.touch.recorded import Recorded as Recorded
-    from hapticrender.touch.recorded import Swipe as Swipe
-    from hapticrender.touch.recorded import Synthetic as Synthetic
     from hapticrender.touch.scene import Scene as Scene
     from hapticrender.touch.touch_panel import TouchPanel as TouchPanel
 

@@ -13,6 +13,7 @@ from hapticrender import defaults
 from hapticrender.accuracy import friction
 from hapticrender.accuracy.suite import CASES, METHOD_FREE, TARGETS, as_rows, run_suite, write_json
 from hapticrender.protocols import Flag
+from hapticrender.recordings.columns import unwrap_counts
 
 MISSES = {  # bounds that the default method misses: each is in docs/figures.md, or within its last digit there
     "white modes": {"free", "slide"},
@@ -76,7 +77,12 @@ def test_what_does_not_depend_on_the_method_is_run_once_and_a_refused_case_is_mi
 
 def test_a_grating_holds_under_the_recorded_finger(shared_data):
     """The encoder of the tribometer, which wraps and stops, over ridges of 1 mm: 40 Hz while it slides."""
-    finger = hr.Finger.recorded(shared_data / "swipe_40mm_s.npz", normal_load=0.5, mechanics="heavy")
+    with np.load(shared_data / "swipe_40mm_s.npz") as file:
+        rate, position = float(file["rate"]), unwrap_counts(file["encoder"]) * float(file["metre_per_count"])
+    touches = [(3.18, 7.42)]  # s: by its normal force
+    inside = position[round(3.18 * rate) : round(7.42 * rate)]
+    middle = (inside.min() + inside.max()) / 2
+    finger = hr.Finger.sampled(position - middle, rate, normal_load=0.5, touches=touches, mechanics="heavy")
     scene = hr.Scene(texture=hr.Grating(wavelength=1e-3, amplitude=10e-6), finger=finger, duration=8.0)
     ours, paper = (hr.render(scene, method=method).summary()["bands"][0] for method in (defaults.METHOD, "paper"))
     errors = [f"rms_error_{place}" for place in ("centre", "end_1", "end_2")]

@@ -103,7 +103,7 @@ def test_a_folder_has_every_picture_and_a_page_of_them(record, tmp_path):
     assert "a &lt;light&gt; touch" in text
     assert "<light>" not in text
     assert "400 Hz: too light a finger" in text
-    fit = hr.fit_load_classes([record] * 2)["light"]
+    fit = next(iter(pictures.fit_all([record] * 2)["light"].values()))
     assert f"{1e-3 * fit.mechanics.stiffness:.2f}" in text
     assert f"{fit.chi_square:.0f} / {fit.degrees_of_freedom}" in text
 

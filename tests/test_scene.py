@@ -18,7 +18,7 @@ from hapticrender.touch.builtin_scenes import builtin_scenes
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import FingerMechanics
-from hapticrender.touch.recorded import Recorded, Synthetic
+from hapticrender.touch.recorded import Recorded
 from hapticrender.touch.scene import MOTIONS, TEXTURES, Scene
 
 GOOD = """
@@ -53,7 +53,7 @@ TEXTURE_CASES = {
     "tone": TONE,
     "partials": Grating(amplitude=1e-6, wavelength=1e-3, partials=[(1, 1, 0), (2.5, -1 / 3, 0.1)]),
     "by velocity": Grating(velocity=np.float64(1 / 30), wavelength=1e-3, speed=0.07, shape="square", phase=-0.3),
-    "synthetic": Synthetic(amplitude=1e-6, speed=0.08, seed=np.uint8(5)),
+    "samples": Recorded(samples=[0, 1 / 3], rate=np.uint16(1000), speed=0.08, amplitude=1e-6),
 }
 
 
@@ -220,7 +220,7 @@ GOOD_TEXTURES = [
     {"kind": "grating", "amplitude": 1e-6, "wavelength": 1e-3, "shape": "square"},
     {"kind": "grating", "velocity": 0.01, "wavelength": 1e-3, "speed": 0.1},
     {"kind": "grating", "level": 20, "frequency": 70.0},
-    {"kind": "synthetic", "amplitude": 1e-6, "speed": 0.1},
+    {"kind": "recorded", "samples": [0.0, 1.0], "rate": 1e3, "amplitude": 1e-6, "speed": 0.1},
     {"kind": "custom", "description": "own"},
     {"kind": "recorded", "amplitude": 1e-6, "file": "absent.wav"},
 ]
@@ -230,7 +230,6 @@ GOOD_FINGERS = [
     {"motion": "sliding", "speed": 0.1, "mechanics": "heavy"},
     {"motion": "swiping", "frequency": 3.0, "stroke": 0.05, "load_scaling": True, "mechanics": "light"},
     {"motion": "sampled", "positions": [0.0, 0.1], "times": [0.0, 1.0], "mechanics": "auto"},
-    {"motion": "recorded", "file": "absent.npz"},
 ]
 
 

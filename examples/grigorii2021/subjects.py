@@ -21,6 +21,7 @@ import numpy as np
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.finger import JND, NEAR
 from examples.grigorii2021.formulas import FREQUENCIES, FREQUENCY, GRID
+from examples.grigorii2021.load_law import load_exponent
 from hapticrender import (
     Finger,
     FingerMechanics,
@@ -30,12 +31,10 @@ from hapticrender import (
     Recording,
     Scene,
     analyse_finger,
-    load_exponent,
     render,
 )
 from hapticrender.analysis import pictures
-from hapticrender.analysis.load_law import Samples
-from hapticrender.analysis.models import LOAD_CLASSES
+from hapticrender.analysis.models import LOAD_CLASSES, Samples
 from hapticrender.analysis.output import NAMES
 from hapticrender.plants.fitting import MECHANICAL
 from hapticrender.plants.plate import PlateParameters
@@ -155,7 +154,6 @@ def loads() -> Item:
                (Curve("mean of the subjects", law.frequency, share, "o"),), "x", (0, 1))),
         "The simulated impedance grows with the load at all frequencies; that a participant's does so from 111 Hz on "
         "only needs participants. R² is lower where the noise is larger beside the impedance.",
-        picture=partial(pictures.draw_load, records),
     )  # fmt: skip
 
 

@@ -3,18 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import inf, log, nan, sqrt
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtrc, ndtri
 
-from hapticrender.analysis.load_law import APART, Samples, Source, parts_of
-from hapticrender.analysis.records import FingerRecord
+from hapticrender.analysis.records import FingerRecord, Impedance
 from hapticrender.checks import require
 from hapticrender.protocols import Array
 from hapticrender.touch.mechanics import HEAVY, LIGHT, LIGHT_BELOW, PARTS, FingerMechanics
 
+APART = 0.01  # two carriers, or two loads, count as different if they differ by more than this, relatively
+BAND = 0.05  # relative width of a bin of frequencies
+Source = FingerRecord | Impedance
 Loads = tuple[float, float]  # N: least, and largest, which is excluded
 LOAD_CLASSES: Mapping[str, Loads] = {"light": (0.0, LIGHT_BELOW), "heavy": (LIGHT_BELOW, inf)}  # N
 FEWEST = {2: 2, 4: 4}  # carriers by order: two numbers each, for three or six parameters and the exponent
@@ -25,6 +27,67 @@ UNITS = {  # of the fit's parameters, which are then near 1: g, N s/m, N/mm
 MOST = dict(zip(UNITS, (1.0, 1e4, 1e6, 1.0, 1e4, 1e6, 10.0), strict=True))  # bounds of FingerMechanics
 MOST_STEPS = 100  # of a search; without a skin in the data its stiffness would grow for ever
 _STIFF_SKIN = (0.1, 20.0, 40.0)  # in these units: hardly a skin
+
+
+def parts_of(impedance: Source | Sequence[Source]) -> list[Source]:
+    """List of the recordings, of which one may stand alone."""
+    parts = [impedance] if isinstance(impedance, FingerRecord | Impedance) else impedance
+    good = isinstance(parts, Sequence) and all(isinstance(each, FingerRecord | Impedance) for each in parts)
+    require(good, "impedance", impedance, "what analyse_finger returns, an Impedance, or a list of them", TypeError)
+    return list(parts)
+
+
+class Samples(NamedTuple):
+    """Unmasked entries of impedances, one row each."""
+
+    frequency: Array  # Hz
+    value: Array  # N s/m, complex
+    standard_error: Array  # N s/m
+    load: Array  # N
+    source: Array  # which of the recordings
+
+    @classmethod
+    def of(cls, impedance: Source | Sequence[Source], loads: tuple[float, float] = (0.0, inf)) -> Self:
+        """Unmasked entries with a load (N) from the first of `loads` to below the second, and above 0."""
+        rising = np.shape(loads) == (2,) and loads[0] < loads[1]
+        require(rising, "loads", loads, "two loads in N, the least and a larger one")
+        parts = [each.impedance if isinstance(each, FingerRecord) else each for each in parts_of(impedance)]
+        rows = [
+            np.broadcast_arrays(each.frequency, each.value, each.standard_error, each.normal_load[:, None], number)
+            for number, each in enumerate(parts)
+        ]
+        columns = [np.concatenate([np.ravel(column) for column in same]) for same in zip(*rows, strict=True)]
+        found = cls(*(columns or [np.empty(0)] * 5))
+        good = np.isfinite(found.frequency) & np.isfinite(found.value) & np.isfinite(found.standard_error)
+        with np.errstate(invalid="ignore"):
+            good &= (found.frequency > 0) & (found.load > 0) & (found.load >= loads[0]) & (found.load < loads[1])
+        found = cls(*(column[good] for column in found))
+        least = found.standard_error.min(initial=inf)
+        require(bool(least > 0), "standard_error", float(least), "> 0 N s/m: mask (NaN) what was not measured")
+        return found
+
+    def by_frequency(self) -> list[Self]:
+        """Split into bins of 5 % of frequency, by rising frequency."""
+        bins = np.rint(np.log(self.frequency) / BAND).astype(int)
+        return [type(self)(*(column[bins == at] for column in self)) for at in np.unique(bins)]
+
+    @property
+    def carriers(self) -> int:
+        """Number of frequencies that differ by more than 1 %."""
+        return len(self.frequency[:1]) + int((np.diff(np.log(np.sort(self.frequency))) > APART).sum())
+
+    @property
+    def loads_differ(self) -> bool:
+        """Whether growth with the load is in the data."""
+        return bool(self.load.size and np.ptp(np.log(self.load)) >= APART)
+
+
+def weighted_mean(value: Array, standard_error: Array) -> tuple[complex, float]:
+    """Mean of complex values weighted by their standard errors, and its own, enlarged where the values scatter more."""
+    weight = standard_error**-2.0
+    mean = complex(np.average(value, weights=weight))
+    scatter = float(np.sum(np.abs(value - mean) ** 2 * weight)) / max(2 * len(value) - 2, 1)
+    return mean, (max(1.0, scatter) / float(weight.sum())) ** 0.5
 
 
 @dataclass(frozen=True)
@@ -151,7 +214,7 @@ def fit_finger(
     """
     require(order in (None, 2, 4), "order", order, "2, 4 or None")
     samples = Samples.of(impedance, loads)
-    found, fewest = _carriers(samples), FEWEST[order or 2]
+    found, fewest = samples.carriers, FEWEST[order or 2]
     if found < fewest:
         raise ValueError(
             f"impedance: {found} different carriers with data at loads from {loads[0]:g} to {loads[1]:g} N, a "
@@ -168,28 +231,6 @@ def fit_finger(
     scatter = max(1.0, fourth.chi_square / max(fourth.degrees_of_freedom, 1))
     gain = (second.chi_square - fourth.chi_square) / scatter - 3 * log(size)
     return replace(fourth, bic_margin=gain) if gain > 0 else replace(second, bic_margin=-gain)
-
-
-def fit_load_classes(
-    impedance: Source | Sequence[Source], classes: Mapping[str, Loads] = LOAD_CLASSES, *, order: int | None = None
-) -> dict[str, FingerFit]:
-    """Fit a finger to every class of loads, as `fit_finger`, by name; a class with too few data is left out.
-
-    `classes` holds least and largest load (N) by name: below and above 0.5 N, as in Table 1 of Grigorii et al. 2021.
-    """
-    fewest = FEWEST[order or 2]
-    return {
-        name: fit_finger(impedance, order, loads=loads)
-        for name, loads in classes.items()
-        if _carriers(Samples.of(impedance, loads)) >= fewest
-    }
-
-
-def _carriers(samples: Samples) -> int:
-    """Number of carriers that differ by more than 1 %."""
-    if not samples.frequency.size:
-        return 0
-    return 1 + int((np.diff(np.log(np.sort(samples.frequency))) > APART).sum())
 
 
 def _impedance(numbers: Mapping[str, Any], frequency: Array, normal_load: float | Array | None) -> Array:

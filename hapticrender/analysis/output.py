@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import weighted_mean
-from hapticrender.analysis.models import UNITS, FingerFit
+from hapticrender.analysis.models import UNITS, FingerFit, weighted_mean
 from hapticrender.analysis.records import KINDS, LOADED, FingerRecord, Series
 from hapticrender.formatting import as_json, table
 from hapticrender.protocols import Array
@@ -136,7 +135,7 @@ above the threshold (loaded); grey spans are below it (unloaded), orange ones ne
 {_picture("frequency.png", pictures, "Modulus and phase of the impedance over frequency, with fits", "too few bands")}
 {_fits(fits)}</section>
 <section><h2>Impedance over the load</h2>
-{_picture("load.png", pictures, "Impedance over load, share explained by the load", ONE_LOAD)}</section>
+{_picture("load.png", pictures, "Impedance over load", ONE_LOAD)}</section>
 {times}"""
     return html_page(f"The finger, measured: {title}", body)
 

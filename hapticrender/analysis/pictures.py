@@ -10,16 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.analysis.load_law import BAND, LoadLaw, Samples, load_exponent, weighted_mean
-from hapticrender.analysis.models import LOAD_CLASSES, FingerFit, fit_finger, fit_load_classes
+from hapticrender.analysis.models import FEWEST, LOAD_CLASSES, FingerFit, Samples, fit_finger, weighted_mean
 from hapticrender.analysis.output import NAMES, SURE, Fits, page_of
 from hapticrender.analysis.records import DOUBTFUL, KINDS, LOADED, UNLOADED, FingerRecord, Series
 from hapticrender.protocols import Array
 from hapticrender.recordings.formats import MissingExtra
-from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, RED, legend, new_figure, save
+from hapticrender.report.figure import BLUE, INK, ORANGE, PALE, legend, new_figure, save
 
 MOST_BANDS = 8  # in one panel
-TYPICAL = 111.0  # Hz: of the paper's Fig. 5, and where |Z_f| begins to grow with the load
 SHADES = {UNLOADED: "#DDDDDD", DOUBTFUL: "#F6DDB0"}
 COLOURS = {2: ORANGE, 4: BLUE}
 POINTS = 1500  # of a curve over time
@@ -28,10 +26,11 @@ POINTS = 1500  # of a curve over time
 def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLike[str]) -> Path:
     """Draw one or several recordings into `folder`, which is made where it is not there; return its page.
 
-    As Grigorii et al. 2021: impedance and load over time (Fig. 5, ``time-1.png`` and so on, one a recording), over the
-    load (Fig. 8 C and D, ``load.png``), and over frequency with fits (Fig. 9, ``frequency.png``); ``index.html`` has
-    them, the parameters with their intervals, and what could not be measured.  A picture without data is left out: that
-    over the load where the loads differ by less than 1 %.  Without matplotlib there are no pictures, and a warning.
+    Load, impedance and motion over time (``time-1.png`` and so on, one a recording); as Grigorii et al. 2021 the
+    impedance over the load (Fig. 8 C, ``load.png``), and over frequency with fits (Fig. 9, ``frequency.png``);
+    ``index.html`` has them, the parameters with their intervals, and what could not be measured.  A picture without
+    data is left out: that over the load where the loads differ by less than 1 %.  Without matplotlib there are no
+    pictures, and a warning.
 
     Raises ValueError without a recording, OSError where the folder cannot be written.
     """
@@ -43,7 +42,7 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
     fits = fit_all(records)
     drawn: dict[str, Any] = {f"time-{i}.png": partial(draw_time, each) for i, each in enumerate(records, 1)}
     if Samples.of(records).loads_differ:
-        drawn["load.png"] = partial(draw_load, records)
+        drawn["load.png"] = partial(draw_load, records, fits)
     if fits:
         drawn["frequency.png"] = partial(draw_frequency, records, fits)
     try:
@@ -60,23 +59,20 @@ def draw(records: FingerRecord | Sequence[FingerRecord], folder: str | os.PathLi
 def fit_all(records: Sequence[FingerRecord]) -> Fits:
     """Fit both orders to every class of loads that has enough data, all recordings together, the better one first."""
     found: Fits = {}
-    for name, fit in fit_load_classes(records).items():
-        found[name] = {fit.order: fit}
-        if isfinite(fit.bic_margin):
-            other = 6 - fit.order
-            found[name][other] = fit_finger(records, other, loads=LOAD_CLASSES[name])
+    for name, loads in LOAD_CLASSES.items():
+        if Samples.of(records, loads).carriers >= FEWEST[2]:
+            fit = fit_finger(records, loads=loads)
+            found[name] = {fit.order: fit}
+            if isfinite(fit.bic_margin):
+                found[name][6 - fit.order] = fit_finger(records, 6 - fit.order, loads=loads)
     return found
 
 
 def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
-    """Draw load and impedance, impedance of every band, and position and velocity over time, unloaded spans shaded."""
-    bands = _shown(record.impedance.value)
-    drawings: list[Any] = [partial(_load_and_impedance, bands=bands)]
-    drawings += [partial(_all_bands, bands=bands)] if len(bands) > 1 else []
-    drawings, heights = [*drawings, _kinematics], [1.5] * len(drawings) + [1.0]
-    with new_figure((9, 2.05 * sum(heights) - 1), pads=(0.1, 0.08)) as figure:
-        panels = figure.subplots(len(drawings), 1, sharex=True, height_ratios=heights)
-        for axes, drawing in zip(panels, drawings, strict=True):
+    """Draw load, impedance of every band, and position and velocity over time, unloaded spans shaded."""
+    with new_figure((9, 7.2), pads=(0.1, 0.08)) as figure:
+        panels = figure.subplots(3, 1, sharex=True, height_ratios=(1.5, 1.5, 1.0))
+        for axes, drawing in zip(panels, (_load, _impedance, _kinematics), strict=True):
             drawing(axes, record)
             for kind, colour in SHADES.items():
                 for segment in record.of_kind(kind):
@@ -86,13 +82,25 @@ def draw_time(record: FingerRecord, path: str | os.PathLike[str]) -> None:
         save(figure, path)
 
 
-def draw_load(records: Sequence[FingerRecord], path: str | os.PathLike[str]) -> None:
-    """Draw the impedance over the load, and how much of it the load explains, over frequency."""
-    pooled, each = load_exponent(records), [load_exponent(one) for one in records]
-    with new_figure((9, 4.2), pads=(0.1, 0.05)) as figure:
-        over_load, share = figure.subplots(1, 2, width_ratios=[1.4, 1])
-        _over_load(over_load, records, pooled)
-        _determination(share, each, pooled)
+def draw_load(records: Sequence[FingerRecord], fits: Fits, path: str | os.PathLike[str]) -> None:
+    """Draw the impedance over the load: windows as dots, the better fit of each class of loads as lines."""
+    bins = Samples.of(records).by_frequency()
+    chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
+    with new_figure((7, 4.2), pads=(0.1, 0.05)) as figure:
+        axes = figure.subplots()
+        for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
+            frequency = np.median(samples.frequency)
+            label = f"{frequency:.0f} Hz"
+            axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5, label=label)
+            for fit in (next(iter(each.values())) for each in fits.values()):
+                lines = [abs(fit.impedance(np.array([frequency]), load)[0]) for load in fit.loads]
+                axes.plot(fit.loads, lines, color=colour, lw=1.6)
+        axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", yscale="log")
+        _numbers(axes.yaxis)
+        if np.ptp(np.log(np.concatenate([each.load for each in bins]))) > 1:
+            axes.set_xscale("log")
+            _numbers(axes.xaxis)
+        axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
         save(figure, path)
 
 
@@ -135,58 +143,40 @@ def _curve(axes: Any, time: Array, series: Series, scale: float, colour: str, la
     return line
 
 
-def _load_and_impedance(axes: Any, record: FingerRecord, bands: list[int]) -> None:
-    """The paper's Fig. 5: load (black) and |Z_f| of one band (red) over one another."""
+def _load(axes: Any, record: FingerRecord) -> None:
     from matplotlib.patches import Patch
 
     lines = [_curve(axes, record.time, record.normal_load, 1.0, INK, "normal load")]
-    axes.set(title="Impedance and load", ylabel="normal load W (N)")
+    axes.set(title="Load", ylabel="normal load W (N)")
     most = float(np.nanmax(np.where(record.contact == LOADED, record.normal_load.value, np.nan), initial=0.1))
     axes.set_ylim(-0.08 * most, 1.25 * most)
-    z = record.impedance
-    if bands:
-        band = min(bands, key=lambda each: abs(np.log(np.nanmedian(z.frequency[:, each]) / TYPICAL)))
-        right = _right(axes)
-        size = np.abs(z.value[:, band])
-        label = f"|Z_f| at {np.nanmedian(z.frequency[:, band]):.0f} Hz"
-        lines.append(_dots(right, z.time, size, z.standard_error[:, band], RED, label))
-        right.set_ylabel("|Z_f| (N s/m)", color=RED)
-        right.tick_params(axis="y", colors=RED)
-        right.set_ylim(-0.08 * np.nanmax(size), 1.25 * np.nanmax(size))
     lines += [Patch(color=SHADES[kind], label=KINDS[kind]) for kind in SHADES if record.of_kind(kind)]
     legend(axes, lines, [each.get_label() for each in lines])
 
 
-def _dots(axes: Any, x: Array, y: Array, error: Array, colour: Any, label: str) -> Any:
-    """Points at rising x with bars of 95 %, joined where none is missing between."""
-    gaps: Any = np.flatnonzero(np.diff(x) > 1.5 * np.median(np.diff(x))) + 1 if len(x) > 1 else []
-    x, y, error = (np.insert(each, gaps, np.nan) for each in (x, y, error))
-    style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8, "label": label}
-    return axes.errorbar(x, y, SURE * error, **style)
-
-
-def _all_bands(axes: Any, record: FingerRecord, bands: list[int]) -> None:
+def _impedance(axes: Any, record: FingerRecord) -> None:
     z = record.impedance
-    for band, colour in zip(bands, _colours(len(bands)), strict=True):
+    axes.set(title="Impedance", ylabel="|Z_f| (N s/m)")
+    if not (bands := _shown(z.value)):
+        return
+    gaps: Any = np.flatnonzero(np.diff(z.time) > 1.5 * np.median(np.diff(z.time))) + 1 if len(z.time) > 1 else []
+    for band, colour in zip(bands, _colours(len(bands)), strict=True):  # joined where no window is missing between
+        columns = z.time, np.abs(z.value[:, band]), SURE * z.standard_error[:, band]
+        style = {"color": colour, "marker": "o", "ms": 3, "lw": 0.9, "elinewidth": 0.8}
         label = f"{np.nanmedian(z.frequency[:, band]):.0f} Hz"
-        _dots(axes, z.time, np.abs(z.value[:, band]), z.standard_error[:, band], colour, label)
-    axes.set(title="Impedance", ylabel="|Z_f| (N s/m)", yscale="log")
+        axes.errorbar(*(np.insert(each, gaps, np.nan) for each in columns), label=label, **style)
+    axes.set_yscale("log")
     _numbers(axes.yaxis)
     size = np.abs(z.value[:, bands])
     axes.set_ylim(0.7 * np.nanmin(size), 1.4 * np.nanmax(size))
     legend(axes, columns=MOST_BANDS)
 
 
-def _right(axes: Any) -> Any:
+def _kinematics(axes: Any, record: FingerRecord) -> None:
+    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
     right = axes.twinx()
     right.grid(False)
     right.spines["right"].set_visible(True)
-    return right
-
-
-def _kinematics(axes: Any, record: FingerRecord) -> None:
-    lines = [_curve(axes, record.time, record.position, 1e3, BLUE, "position (mm)")]
-    right = _right(axes)
     lines.append(_curve(right, record.time, record.velocity, 1e3, ORANGE, "velocity (mm/s)"))
     axes.set(title="Motion", ylabel="position (mm)")
     right.set_ylabel("velocity (mm/s)")
@@ -195,52 +185,6 @@ def _kinematics(axes: Any, record: FingerRecord) -> None:
         reach = 1.3 * float(np.quantile(loaded, 0.99)) if loaded.size else 1.0
         panel.set_ylim(-max(reach, 0.1), max(reach, 0.1))
     legend(axes, lines, [each.get_label() for each in lines])
-
-
-def _over_load(axes: Any, records: Sequence[FingerRecord], law: LoadLaw) -> None:
-    """The paper's Fig. 8 C: windows as dots, a fitted power a frequency, and mean and deviation of every recording."""
-    bins = Samples.of(records).by_frequency()
-    chosen = [bins[i] for i in _shown(np.ones((1, len(bins))))]
-    for samples, colour in zip(chosen, _colours(len(chosen)), strict=True):
-        label = f"{np.median(samples.frequency):.0f} Hz"
-        at = int(np.argmin(np.abs(law.frequency - np.median(samples.frequency))))
-        axes.plot(samples.load, np.abs(samples.value), ".", color=colour, ms=2.5, alpha=0.5)
-        reach = np.array([samples.load.min(), samples.load.max()])
-        line = law.magnitude[at] * (reach / law.reference_load[at]) ** law.exponent[at]
-        axes.plot(reach, line, color=colour, lw=1.6, label=label)
-    if len(records) > 1:
-        _means(axes, records, float(law.frequency[np.argmin(np.abs(np.log(law.frequency / TYPICAL)))]))
-    axes.set(title="Impedance over load", xlabel="normal load W (N)", ylabel="|Z_f| (N s/m)", yscale="log")
-    _numbers(axes.yaxis)
-    if np.ptp(np.log(np.concatenate([each.load for each in bins]))) > 1:
-        axes.set_xscale("log")
-        _numbers(axes.xaxis)
-    axes.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), handlelength=1.2)
-
-
-def _means(axes: Any, records: Sequence[FingerRecord], frequency: float) -> None:
-    """Mean and standard deviation of load and impedance of every recording at one frequency, black as in Fig. 8 C."""
-    label: str | None = f"each at {frequency:.0f} Hz"
-    for record in records:
-        bins = Samples.of(record).by_frequency()
-        near = [each for each in bins if abs(np.log(np.median(each.frequency) / frequency)) < BAND]
-        if near:
-            load, size = near[0].load, np.abs(near[0].value)
-            style = {"color": "black", "marker": "o", "ms": 4, "lw": 0, "elinewidth": 1.0, "zorder": 5, "label": label}
-            axes.errorbar(load.mean(), size.mean(), size.std(), load.std(), **style)
-            label = None
-
-
-def _determination(axes: Any, each: list[LoadLaw], pooled: LoadLaw) -> None:
-    """The paper's Fig. 8 D: coefficient of determination between load and impedance, within a recording."""
-    for law in each:
-        axes.plot(law.frequency, law.determination, "o", color=PALE, ms=3, alpha=0.7)
-    shares = [(np.log(f), share) for law in each for f, share in zip(law.frequency, law.determination, strict=True)]
-    near = [[share for at, share in shares if abs(at - np.log(f)) < BAND] for f in pooled.frequency]
-    mean = [np.mean(found) if found else np.nan for found in near]
-    axes.plot(pooled.frequency, mean, "o-", color=INK, lw=1.4, ms=4, label="mean" if len(each) > 1 else None)
-    axes.set(title="|Z_f| explained by the load", ylabel="R² within a recording", ylim=(-0.03, 1.03))
-    _frequency_axis(axes, pooled.frequency)
 
 
 def _over_frequency(column: Any, name: str, fits: Mapping[int, FingerFit], samples: Samples) -> None:
@@ -284,8 +228,3 @@ def _numbers(axis: Any, within: str = "235") -> None:
     """Plain numbers on a logarithmic axis, also `within` a decade."""
     axis.set_major_formatter(lambda value, _: f"{value:g}")
     axis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in within else "")
-
-
-def _frequency_axis(axes: Any, frequency: Array) -> None:
-    axes.set(xlabel="frequency (Hz)", xlim=(0.87 * frequency.min(), 1.15 * frequency.max()), xscale="log")
-    _numbers(axes.xaxis, "25")

@@ -15,7 +15,6 @@ from hapticrender.protocols import Array
 from hapticrender.recordings.formats import h5_arrays, mat_arrays, naming_damage, npz_arrays
 from hapticrender.recordings.journal import Header, join
 from hapticrender.touch.scene import Custom, Scene
-from hapticrender.touch.tribometer import unwrap_counts
 
 METHOD = "recorded elsewhere"
 EVEN = 0.5  # samples: farthest that a time may be from its place on an even grid
@@ -137,6 +136,13 @@ def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[s
         require(not np.isinf(values).any(), f"{key}: column {name}", np.inf, "finite, or NaN where there is no value")
         found.append((name, values))
     return found
+
+
+def unwrap_counts(counts: Array) -> Array:
+    """Positions (int64) of a counter of unsigned integers that wraps both ways, from the first count, signed, on."""
+    counts = counts.astype(counts.dtype.newbyteorder("="))
+    signed = f"i{counts.itemsize}"
+    return np.cumsum(np.append(counts[:1].view(signed), np.diff(counts).view(signed)), dtype=np.int64)
 
 
 def _rate(rate: float | None, time: Array | None, count: int) -> float:

@@ -40,7 +40,6 @@ class Envelopes:
     has_target: Array  # bool (w, n): the target is not zero all through the window
     frequency: Array  # (w, n), Hz: mean magnitude; 0 for a finger-locked carrier while the finger is up
     backward: Array  # bool (w, n): the carrier runs backwards, as a finger-locked one does on the way back
-    residual: Array  # (w,), m^2: mean square of the motion at the first place beside carriers, offset and slope
 
     @property
     def time(self) -> Array:
@@ -118,11 +117,7 @@ def _analyse_batch(recording: Recording, first: Array, size: int) -> dict[str, A
     position, target = recording.read("position", start, stop), recording.read("target", start, stop)
     phase = bands.carrier_phase(np.arange(start, stop) / rate, position)
     signals = np.column_stack([recording.read("reference", start, stop), recording.read("motion", start, stop)])[index]
-    envelope, inflation, rest = fit(phase[index], signals)
-    # a window in which the target fades holds intended motion that no constant envelope explains: it is subtracted
-    floor = RIDGE * np.mean(signals[..., 0] ** 2, axis=1) + np.finfo(float).tiny
-    multiple = np.mean(rest[..., 1] * rest[..., 0], axis=1) / (np.mean(rest[..., 0] ** 2, axis=1) + floor)
-    residual = rest[..., 1] - multiple[:, None] * rest[..., 0]
+    envelope, inflation = fit(phase[index], signals)
     signed = _quarterly(bands, rate, position[index])
     frequency = abs(signed)
     fast = np.all(frequency >= LOWEST_FREQUENCY * (1 - 1e-6), axis=1)
@@ -133,15 +128,14 @@ def _analyse_batch(recording: Recording, first: Array, size: int) -> dict[str, A
         "has_target": (target != 0)[index].all(axis=1),
         "frequency": frequency.mean(axis=1),
         "backward": signed.mean(axis=1) < 0.0,
-        "residual": np.mean(residual**2, axis=1),
     }
 
 
-def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
+def fit(phase: Array, signals: Array) -> tuple[Array, Array]:
     """Least-squares envelopes of all carriers at once, with an offset and a slope, in w windows of m samples.
 
-    From the carriers' `phase` (w, m, n_bands), rad, and `signals` (w, m, s): envelopes (complex, (w, s, n_bands)), the
-    variance of an envelope's worse part over that of a lone carrier (w, n_bands), and the residual (w, m, s).
+    From the carriers' `phase` (w, m, n_bands), rad, and `signals` (w, m, s): envelopes (complex, (w, s, n_bands)), and
+    the variance of an envelope's worse part over that of a lone carrier (w, n_bands).
     """
     windows, size, n_bands = phase.shape
     regressors = np.empty((windows, size, 2 * n_bands + 2))
@@ -154,12 +148,10 @@ def fit(phase: Array, signals: Array) -> tuple[Array, Array, Array]:
     normal += RIDGE * size * np.eye(2 * n_bands + 2)
     inverse = np.linalg.inv(normal)
     with np.errstate(**DIVERGING):
-        solution = inverse @ (transposed @ signals)
-        rest = signals - regressors @ solution
-    parts = solution.transpose(0, 2, 1)
+        parts = (inverse @ (transposed @ signals)).transpose(0, 2, 1)
     envelope = parts[..., :n_bands] + 1j * parts[..., n_bands:-2]
     variance = np.diagonal(inverse, axis1=1, axis2=2)[:, :-2].reshape(windows, 2, n_bands).max(axis=1)
-    return envelope, variance * (size / 2), rest
+    return envelope, variance * (size / 2)
 
 
 def _quarterly(bands: Bands, rate: float, finger: Array) -> Array:

@@ -1,7 +1,6 @@
 """Read and write recordings in several formats."""
 
 import itertools
-import json
 import math
 import os
 import uuid
@@ -18,7 +17,6 @@ from hapticrender.protocols import Array
 from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
 
 Arrays = dict[str, tuple[float, Callable[[], Any]]]  # of a file, by name: bytes (NaN: not here), and what reads it
-COMMENT_LIMIT = 4000  # characters; libsndfile drops a longer WAV comment silently
 
 
 class MissingExtra(HapticError, ImportError):
@@ -32,9 +30,6 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     recording of this library, a `MissingExtra` where reading it takes an optional part that is not installed.
     """
     path = Path(path)
-    if path.suffix.lower() in SOUND_CONTAINERS:
-        cause = "because its rate is rounded and its header may be cut"
-        raise ValueError(f"{path}: a sound file cannot be loaded, {cause}: load one saved as {', '.join(READERS)}")
     reader = _by_suffix(path, READERS, "read")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
@@ -52,17 +47,22 @@ def write(path: str | os.PathLike[str], header: Header, frames: Any) -> None:
 
 
 def write_sound(path: Path, signal: Array, rate: float, unit: str) -> float:
-    """Write a signal (n, channels) as 24-bit sound; return its full scale, which the file's comment states.
+    """Write a signal (n, channels) as a 24-bit WAV file; return its full scale, which the file's comment states.
 
     That is 1, 2 or 5 times a power of ten above the peak, in `unit`; what is not finite becomes silence.  Sound files
     hold the `rate` (Hz) rounded.
     """
+    import soundfile
+
     signal = np.nan_to_num(np.asarray(signal, float), nan=0.0, posinf=0.0, neginf=0.0)
-    full_scale = round_up(float(np.abs(signal).max(initial=0.0)))
-    comment = f"full scale = {full_scale:.6g} {unit}"
-    container = _by_suffix(path, SOUND_CONTAINERS, "written as sound")
+    full_scale, whole = round_up(float(np.abs(signal).max(initial=0.0))), max(1, round(rate))
     with replacing(path) as scratch:
-        _write_audio(scratch, container, "PCM_24", signal / full_scale, rate, comment)
+        try:
+            with soundfile.SoundFile(scratch, "w", whole, signal.shape[1], "PCM_24", format="WAV") as file:
+                file.comment = f"full scale = {full_scale:.6g} {unit}"
+                file.write(signal / full_scale)
+        except soundfile.SoundFileError as error:
+            raise OSError(f"{path}: {error}") from error
     return full_scale
 
 
@@ -236,30 +236,6 @@ def _read_csv(path: Path) -> tuple[Header, Array]:
     return header, numbers[:, 1:]
 
 
-def _write_doubles(path: Path, header: Header, frames: Any) -> None:
-    """All columns as 64-bit float channels; the comment, where the format has one, is the header if it fits."""
-    container = SOUND_CONTAINERS[path.suffix]
-    comment = header.to_json()
-    if len(comment) > COMMENT_LIMIT:
-        comment = json.dumps({"rate": header.rate, "columns": header.widths})
-    _write_audio(path, container, "DOUBLE", frames, header.rate, comment)
-
-
-def _write_audio(path: Path, container: str, subtype: str, frames: Any, rate: float, comment: str) -> None:
-    import soundfile
-
-    channels = frames[:1].shape[1]
-    try:
-        with soundfile.SoundFile(path, "w", max(1, round(rate)), channels, subtype, format=container) as file:
-            if container != "W64":  # has no room for text
-                file.comment = comment
-            for block in chunks(frames, channels):
-                file.write(block)
-    except soundfile.SoundFileError as error:
-        raise OSError(f"{path}: {error}") from error
-
-
-SOUND_CONTAINERS = {".wav": "WAV", ".w64": "W64", ".rf64": "RF64", ".flac": "FLAC"}
 READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
     ".au": read_journal,
     ".npz": _reader(npz_arrays),
@@ -275,5 +251,4 @@ WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".hdf5": _write_h5,
     ".mat": _write_mat,
     ".csv": _write_csv,
-    **dict.fromkeys((".wav", ".w64", ".rf64"), _write_doubles),
 }

@@ -26,29 +26,23 @@ UNJUDGED: dict[str, Any] = {"figure": "waveform_error", "value": None, "bound": 
 
 @np.errstate(**DIVERGING)
 def summary(recording: Recording) -> dict[str, Any]:
-    """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure.
+    """Figures and verdict as plain numbers, strings, lists and dicts; None for no figure (docs/theory.md, section 7).
 
-    The verdict rests on `waveform`, which compares the motion y at every place with the reference r, the texture as the
-    scene specifies it, without time shift or gain fit.  It is "passed" where at every place `waveform_error`, E =
-    rms_B(y - r)/rms_B(r), is within the tolerance, `window_error`, the 95th percentile of the same in windows of 100
-    ms, and the worst `third_octave_error` (on a plate up to 1000 Hz) are within twice the tolerance, and no sample is
-    flagged as saturated or faulty; "passed in band" where besides more than 1 % of the texture's energy is outside 20
-    to 500 Hz (B) and above the detection threshold; else "failed", or "not judged" where nothing can be said, or the
-    run was cut off before a figure failed, and no sample is flagged.  `worst` is the figure furthest over its `bound`;
-    `reason` states what else decided.  See ``waveform_figures`` for the equations.  `contacts` are the errors after
-    touches and lifts; `delay` (s), `gain` and `incoherent` share state how y differs from r and decide nothing, like
-    all that follows.
+    `verdict` is "passed", "passed in band" (part of the texture's energy cannot be played), "failed" or "not judged";
+    it rests on `waveform_error`, `window_error` and `third_octave_error` at every place in `waveform`, and on flags.
+    `worst` is the figure furthest over its `bound`; `reason` states what else decided.  `contacts` are the errors after
+    touches and lifts; `delay` (s), `gain` and `incoherent` share state how the motion differs from the reference and
+    decide nothing, like all that follows.
 
     Relative errors of a band compare with the target at every place over the judged windows: `error_*` is that of the
-    mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `complex_error` the rms of
-    |X - target| at the first place over the same, `phase_error` the lead of the mean there.
+    mean amplitude, `rms_error_*` the rms of |X| - |target| over the rms of |target|, `phase_error` the lead of the mean
+    at the first place.  `frequency` of a finger-locked band is the median while it is judged.  `settling_time` is None
+    unless the band stays within 5 % of its target, in amplitude and phase, for the last 0.5 s, or 10 % of the judged
+    time where shorter.
 
     `wobble` (m) is the rms of the narrowband motion at the first place that is no multiple of its target: the root of
     sum_k mean |X_k - c_k target_k|^2 / 2 with c_k by least squares; a window of 2 periods passes variations up to about
-    0.44/window.  `residual_rms` (m) is the rms of all other motion there, see `Envelopes.residual`.
-
-    `frequency` of a finger-locked band is the median while it is judged.  `settling_time` is None unless the band stays
-    within 5 % of its target, in amplitude and phase, for the last 0.5 s, or 10 % of the judged time where shorter.
+    0.44/window.
     """
     header, places = recording.header, [place.replace(" ", "_") for place in recording.header.places]
     envelopes, begin = recording.envelopes, judged_from(recording)
@@ -58,7 +52,6 @@ def summary(recording: Recording) -> dict[str, Any]:
     worst, misses, noise = _worst(recording)
     verdict, reason = _verdict(recording, worst, misses, noise)
     flags = _flag_counts(recording)
-    residual = _mean(envelopes.residual[settled & envelopes.finite])
     names = ("device", "method", "seed", "unit", "rate", "tolerance", "motion_source")
     return {
         "scene": header.name,
@@ -72,7 +65,6 @@ def summary(recording: Recording) -> dict[str, Any]:
         "waveform": recording.waveform,
         "bands": bands,
         "wobble": _wobble(envelopes, judged),
-        "residual_rms": math.sqrt(residual) if residual is not None and math.isfinite(residual) else None,
         "saturated_share": flags[Flag.SATURATED] / max(1, len(recording)),
         "flags": {str(flag.name): count for flag, count in flags.items() if count},
         "notes": _notes(recording, bands, settled, flags[Flag.TWO_TOUCHES]),
@@ -90,14 +82,13 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     lead = achieved[:, 0] * target.conj()
     lead = np.where(envelopes.backward[judged, k], lead.conj(), lead)  # a lead stays a lead on the way back
     some = bool(judged.any())
-    mean, size = _mean(np.abs(target)), np.sqrt(np.mean(np.abs(target) ** 2)) if some else 0.0
+    mean = _mean(np.abs(target))
     frequency = envelopes.frequency[judged, k]
     figures: dict[str, Any] = {
         "frequency": float(bands.frequency[k]) if not wavenumber else float(np.median(frequency)) if some else None,
         "wavelength": 1 / wavenumber if wavenumber else None,
         "target": mean,
         "achieved": _mean(np.abs(achieved[:, 0])),
-        "complex_error": float(np.sqrt(np.mean(np.abs(achieved[:, 0] - target) ** 2)) / size) if size else None,
         "phase_error": float(np.angle(lead.mean())) if some else None,
         "settling_time": _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_seconds)),
         "judged_windows": int(judged.sum()),

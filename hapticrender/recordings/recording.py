@@ -285,7 +285,7 @@ class Recording:
         return True
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to .au, .npz, .h5, .hdf5, .mat or .csv (these can be loaded again), .wav, .w64 or .rf64."""
+        """Write to .au, .npz, .h5, .hdf5, .mat or .csv, which can be loaded again; sound programs open .au."""
         formats.write(path, self.header, self.frames)
 
     @classmethod

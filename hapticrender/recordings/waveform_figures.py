@@ -1,5 +1,7 @@
 """Figures of the waveform: the motion against the texture as the scene specifies it, without time shift or gain fit.
 
+Equations and reasons: docs/theory.md, section 7.
+
 Symbols: r reference, y motion at a place over the place's share of the target, e = y - r; rms_B over B = 20 to 500 Hz,
 rms_b over a third octave b with both edges in B (on a plate also above, see `_thirds`); S_b detection threshold (rms)
 in it.  Over the whole play both come from spectra, windows of 100 ms and contacts from signals filtered without phase;
@@ -186,11 +188,7 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
 def _thirds(
     spectrum: Array, frequency: Array, rate: float, unit: str, floor: Callable[[float], float], share: float
 ) -> dict[str, Any]:
-    """``e_b = rms_b(e)/max(rms_b(r), floor(b))`` of every third octave b inside B, and the largest.
-
-    On a plate (m) those above B count, too, up to 1000 Hz or 0.4 of the rate: a device need not follow r there, so
-    only the excess ``rms_b(y) - rms_b(r)``, r times its `share` at a quiet place, is an error where less than rms_b(e).
-    """
+    """Error of every third octave in B (on a plate, m, also above), and the largest; `share` is that of r there."""
     low, high = _band(rate)
     found = {}
     for name, middle in zip(NOMINAL, THIRDS, strict=True):
@@ -204,12 +202,7 @@ def _thirds(
 
 
 def _floor(recording: Recording, rms: float, place: int, middle: float) -> float:
-    """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it.
-
-    S_b is the detection threshold on a plate, of the motion at the place itself; of other quantities, for which none is
-    known, 1 % of the `rms` of the whole reference.  It is never below twice the noise of the sensors where the
-    motion comes from them.
-    """
+    """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it."""
     header = recording.header
     scale = float(_scales(header)[1][place])
     least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale if header.unit == "m" else SPUR * rms
@@ -234,11 +227,7 @@ def _outside(reference: Array, frequency: Array, inside: Array, unit: str) -> fl
 
 
 def _likeness(frequency: Array, spectrum: Array, cross: Array, sign: float) -> dict[str, float]:
-    """Best delay (s) and gain of y over r within 20 ms, and the share of y's energy that they do not explain.
-
-    ``c(tau) = Re sum_f R* Y exp(j 2 pi f tau)`` is largest at the delay; gain ``c/sum |R|^2``, incoherent share
-    ``1 - c^2/(sum |R|^2 sum |Y|^2)``.
-    """
+    """Best delay (s) and gain of y over r within 20 ms, and the share of y's energy that they do not explain."""
     from scipy.signal import czt
 
     reference, error = spectrum.T

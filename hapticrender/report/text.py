@@ -80,9 +80,8 @@ def waveform_rows(summary: Mapping[str, Any]) -> list[list[str]]:
 
 def remarks(summary: Mapping[str, Any]) -> list[str]:
     """State what the tables of a run do not have and what decides nothing, and its notes, a line each."""
-    wobble, residual = (quantity(summary[key], summary["unit"]) for key in ("wobble", "residual_rms"))
-    saturated, places = percent(summary["saturated_share"]), at(list(summary["waveform"]["places"]))
-    bands = f"rms errors {places}; wobble {wobble}, beside the bands {residual}, saturated {saturated}"
+    wobble, saturated = quantity(summary["wobble"], summary["unit"]), percent(summary["saturated_share"])
+    bands = f"rms errors {at(list(summary['waveform']['places']))}; wobble {wobble}, saturated {saturated}"
     return [beside(summary), bands, *summary["notes"]]
 
 

@@ -3,12 +3,15 @@
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
-from hapticrender.touch.recorded import Synthetic
+from hapticrender.touch.recorded import Recorded
 from hapticrender.touch.scene import Scene
 
 DEVICES = ("vt-plate", "electroadhesion", "ultrasonic", "hybrid")
+PARTIALS = np.array([43.0, 105.0, 171.0, 240.0, 326.0, 398.0])  # Hz, at 80 mm/s: of the recordings
 PAPER_FREQUENCIES = (20.0, 31.0, 47.0, 72.0, 111.0, 170.0, 261.0, 400.0)  # Hz: the gratings of Grigorii et al. 2021
 SWEEPING = Finger.swiping(frequency=0.5, speed=0.08, normal_load=0.3, mechanics="light")  # to and fro, up to 80 mm/s
 LIFTING = Finger.sliding(  # slides, reverses, lifts and touches again
@@ -37,6 +40,15 @@ def _scene(name: str, texture: Any, finger: Finger, duration: float, **fields: A
     return Scene(name=name, texture=texture, finger=finger, duration=duration, **fields)
 
 
+def _recording(gain: float, carriers: int | None) -> Recorded:
+    """64 mm of a surface, recorded at 80 mm/s, of partials that swell and together stay below `gain` (m)."""
+    phase, start = np.random.default_rng(0).uniform(0.0, 2 * np.pi, (2, len(PARTIALS)))
+    turn = 2 * np.pi * np.arange(800)[:, None] / 1000
+    values = ((1 + 0.5 * np.cos(0.5 * turn + start)) * np.cos(PARTIALS * turn + phase)).sum(axis=1)
+    samples = (values / (1.5 * len(PARTIALS))).round(3).tolist()
+    return Recorded(samples=tuple(samples), rate=1000.0, speed=0.08, gain=gain, carriers=carriers)
+
+
 def _on_the_plate(carriers: int | None) -> Iterator[Scene]:
     """The paper's gratings on the free plate, ridges of 1 mm, a recording, a slide, a press, and fast swipes."""
     for frequency in PAPER_FREQUENCIES:
@@ -44,7 +56,7 @@ def _on_the_plate(carriers: int | None) -> Iterator[Scene]:
         yield _scene(f"grating-{frequency:g}", texture, Finger.absent(), 5.0, tolerance=0.02)
     ridges = Grating(amplitude=10e-6, wavelength=1e-3)  # 80 Hz at 80 mm/s
     yield _scene("spatial-grating", ridges, LIFTING, 6.0)
-    yield _scene("recorded-texture", Synthetic(amplitude=20e-6, speed=0.08, carriers=carriers), SWEEPING, 5.0)
+    yield _scene("recorded-texture", _recording(20e-6, carriers), SWEEPING, 5.0)
     wandering = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
     yield _scene("sliding", Grating(amplitude=50e-6, frequency=143.0), wandering, 5.0)  # near the rocking mode
     press = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")  # its sag is many times the target
@@ -57,8 +69,7 @@ def _by_friction(carriers: int | None) -> Iterator[Scene]:
     """Ridges and a recording on a screen, swipes on an ultrasonic plate, and one that warms up."""
     ridges = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
     yield _scene("screen-spatial", ridges, LIFTING, 6.0, device="electroadhesion")
-    recorded = Synthetic(amplitude=40e-6, speed=0.08, carriers=carriers)
-    yield _scene("screen-recorded", recorded, SWEEPING, 5.0, device="electroadhesion")
+    yield _scene("screen-recorded", _recording(40e-6, carriers), SWEEPING, 5.0, device="electroadhesion")
     swipes = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
     slower = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)
     yield _scene("ultrasonic-swiping", slower, swipes, 4.0, device="ultrasonic")

@@ -1,6 +1,5 @@
 """The finger: trajectory, normal load, touches and mechanics."""
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -10,7 +9,7 @@ import numpy as np
 from hapticrender.checks import Validated, checked, flag, keep, number, numbers, require, rising
 from hapticrender.protocols import Array, Motion
 from hapticrender.touch.mechanics import NONE, FingerMechanics, read_mechanics
-from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
+from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, SineMotion, Still, TriangleMotion
 
 MOST_LOAD = 20.0  # N
 
@@ -49,11 +48,11 @@ class Finger(Validated):
     Parameters
     ----------
     motion : Motion
-        `Still`, `TriangleMotion`, `SineMotion`, `Sampled`, `RecordedMotion`, `Nowhere`, or any
+        `Still`, `TriangleMotion`, `SineMotion`, `Sampled`, `Nowhere`, or any
         object with ``position(time)``; NaN means lifted.
     normal_load : float, N, or (times in s, loads in N), or None
         >= 0 and <= 20; a curve is joined by straight lines and held at both
-        ends.  None: as recorded, for a motion that has a load (`RecordedMotion`).
+        ends.  None: that of the motion, which has a method ``load(time)``.
     touches : sequence of (on, off), s, or None
         The finger touches while on <= t < off; None: whenever its motion has a position.
     mechanics : FingerMechanics, or a name, or a table of its numbers
@@ -118,11 +117,6 @@ class Finger(Validated):
     ) -> Self:
         """Return a finger at given `positions` (m), at `rate` (Hz) or at `times` (s)."""
         return cls(Sampled(positions, rate, times), normal_load, **touch)
-
-    @classmethod
-    def recorded(cls, file: str | os.PathLike[str], start: float = 0.0, normal_load: Any = None, **touch: Any) -> Self:
-        """Return the finger of a tribometer recording, from `start` (s) on, with its own load unless given."""
-        return cls(RecordedMotion(os.fspath(file), start), normal_load, **touch)
 
     def position(self, time: Array) -> Array:
         """Position (m from the middle of the surface, shape (n,)), NaN while lifted."""

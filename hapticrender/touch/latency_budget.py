@@ -38,14 +38,13 @@ def settled_gain(estimator: MotionEstimator, rate: float, speed: float = 0.0) ->
     return np.asarray(predicted[:, 0] / (predicted[0, 0] + 1.0) / step ** np.arange(3))
 
 
-def _system(gain: Array, step: float, latency: float = 0.0, smoothing: float = 0.0) -> tuple[Array, Array]:
-    """A (5, 5) and B (5,) of the module; without `smoothing` corrections are 0."""
+def _system(gain: Array, step: float, latency: float = 0.0) -> tuple[Array, Array]:
+    """A (5, 5) and B (5,) of the module."""
     a, b = np.zeros((5, 5)), np.zeros(5)
     a[:3, :3], b[:3] = (np.eye(3) - np.outer(gain, [1.0, 0.0, 0.0])) @ transition(step), gain
-    if smoothing > 0.0:
-        jump = -transition(latency)[0] @ gain  # of the position that is played, per innovation, at the sample's arrival
-        a[3:, :3], b[3:] = -jump * transition(step)[0], jump
-        a[3:, 3:] = math.exp(-step / smoothing) * np.array([[1.0, 0.0], [step / smoothing, 1.0]])
+    jump = -transition(latency)[0] @ gain  # of the position that is played, per innovation, at the sample's arrival
+    a[3:, :3], b[3:] = -jump * transition(step)[0], jump
+    a[3:, 3:] = math.exp(-step / SMOOTHING) * np.array([[1.0, 0.0], [step / SMOOTHING, 1.0]])
     return a, b
 
 
@@ -56,17 +55,15 @@ def position_error(
     frequency: float = FREQUENCY,
     delay: float = 0.0,
     predicted: bool = True,
-    smoothing: float = SMOOTHING,
 ) -> float:
     """Error of the position at which a texture is played (m rms), for a swipe and all its reversals.
 
     `speed` (m/s, >= 0) is the peak of a sinusoidal swipe of `frequency` (Hz, > 0); `delay` (s, >= 0) is that behind the
     sensor, from an estimate to the surface, as far as the device's own loop does not predict it.  Where it is not
-    `predicted`, the last sample is played as it is, without an estimator.  Corrections are spread by a pair of poles
-    of `smoothing` (s, >= 0; 0: none).
+    `predicted`, the last sample is played as it is, without an estimator.
     """
     require(isinstance(panel, TouchPanel), "panel", panel, "a TouchPanel", TypeError)
-    speed, smoothing = number("speed", speed, "m/s", least=0.0), number("smoothing", smoothing, "s", least=0.0)
+    speed = number("speed", speed, "m/s", least=0.0)
     omega, step = 2 * math.pi * number("frequency", frequency, "Hz", above=0.0), 1.0 / panel.rate
     late = panel.latency + number("delay", delay, "s", least=0.0)
     amplitude, rms = speed / omega, speed / math.sqrt(2.0)
@@ -75,7 +72,7 @@ def position_error(
     if predicted:
         from scipy.linalg import solve_discrete_lyapunov
 
-        a, b = _system(settled_gain(estimator, panel.rate, rms), step, late, smoothing)
+        a, b = _system(settled_gain(estimator, panel.rate, rms), step, late)
         turn = np.exp(1j * omega * step)
         played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), solve_discrete_lyapunov(a, np.outer(b, b))
     shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
@@ -83,7 +80,7 @@ def position_error(
         shares.append(shares[-1] * panel.dropouts)
     for (lost, share), part in product(enumerate(shares), AGES):
         age = (lost + part) / panel.rate  # of the last sample (s), beside its latency
-        u = age / smoothing if smoothing > 0.0 else 0.0
+        u = age / SMOOTHING
         row = np.r_[transition(late + age)[0], u * math.exp(-u), math.exp(-u)]  # C(h)
         found, noise = (row @ played, row @ spread @ row) if predicted else (1.0, 1.0)
         bias = 0.5 * (amplitude * abs(found - np.exp(1j * omega * (late + age)))) ** 2

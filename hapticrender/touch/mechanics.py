@@ -33,15 +33,11 @@ class FingerMechanics(Validated):
     or for order 2 the whole finger; those of the phalanx are for order 4 only.  They hold at `reference_load` (N), for
     scaling with W**(1/3).
 
-    Notes
-    -----
-    The equation of the phalanx is ``0 = m_p x_p'' + b_p x_p' + k_p x_p + b_s (x_p' - x_s') + k_s (x_p - x_s)``; the
-    paper prints b_p x_s' in it, which is off by up to 35 % (72 Hz, light finger).
-
     References
     ----------
     Grigorii, Li, Peshkin, Colgate: Comparison of wide-band vibrotactile and
-    friction modulation surface gratings, 2021, Table 1 and its equations of the finger.
+    friction modulation surface gratings, 2021, Table 1 and its equations of the finger, one of
+    them corrected (docs/theory.md, section 3).
 
     Examples
     --------

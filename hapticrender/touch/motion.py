@@ -6,12 +6,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from hapticrender.checks import Validated, checked, exactly_one, file_name, keep, numbers, parameter, require, rising
+from hapticrender.checks import Validated, checked, exactly_one, keep, numbers, parameter, rising
 from hapticrender.protocols import Array
-from hapticrender.touch.tribometer import MOST_SPEED, SwipeRecording, load_swipe
 
 FARTHEST = 1.0  # m from the middle; each renderer checks its own surface
 LONGEST_TIME = 360_000.0  # s: 100 h
+MOST_SPEED = 10.0  # m/s
 
 
 @dataclass(frozen=True)
@@ -114,39 +114,3 @@ class Sampled(Validated):
     def position(self, time: Array) -> Array:
         """Position (m, shape (n,))."""
         return np.interp(np.asarray(time, float), *self._curve)
-
-
-@dataclass(frozen=True)
-class RecordedMotion(Validated):
-    """A finger recorded by a tribometer: unwrapped encoder, NaN while lifted, with its normal load."""
-
-    kind: ClassVar[str] = "recorded"
-
-    file: str = checked(file_name)  # .npz as for `Swipe`
-    start: float = parameter(0.0, "s", most=LONGEST_TIME)  # where in the recording t = 0 lies
-
-    @property
-    def recording(self) -> SwipeRecording:
-        """The recording; read at the first use."""
-        return load_swipe(self.file)
-
-    def check(self) -> None:
-        """Read the file, so that a bad one is refused before anything plays."""
-        end = self.recording.duration
-        require(self.start <= end, "start", self.start, f"<= {end:g} s, the end of the recording")
-
-    def position(self, time: Array) -> Array:
-        """Position (m, shape (n,)), NaN while lifted and outside the recording."""
-        return self._at(time, self.recording.position, np.nan)
-
-    def load(self, time: Array) -> Array:
-        """Return the normal load (N, shape (n,)), 0 while lifted."""
-        return self._at(time, self.recording.normal_load, 0.0)
-
-    def _at(self, time: Array, curve: Array, lifted: float) -> Array:
-        """Values of a curve of the recording, `lifted` where the nearest sample does not touch."""
-        sample, touching = (np.asarray(time, float) + self.start) * self.recording.rate, self.recording.touching
-        nearest = np.rint(sample).astype(np.int64)
-        inside = (nearest >= 0) & (nearest < touching.size)
-        touched = inside & touching[np.clip(nearest, 0, touching.size - 1)]
-        return np.where(touched, np.interp(sample, np.arange(curve.size), curve), lifted)

@@ -1,8 +1,8 @@
-"""Recorded textures: a sound file, the lateral force of a real swipe, and a synthetic one that needs no file."""
+"""Recorded textures: samples, or a sound file."""
 
 import re
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,7 +15,7 @@ from hapticrender.protocols import Array
 from hapticrender.touch.composed import Composable
 from hapticrender.touch.curve import Curve, strongest_carriers
 from hapticrender.touch.grating import MOST_AMPLITUDE
-from hapticrender.touch.tribometer import MOST_SPEED, load_swipe
+from hapticrender.touch.motion import MOST_SPEED
 
 MOST_FRAMES = 1 << 24
 MOST_SAMPLES = 1 << 26  # in all channels: what is decoded
@@ -30,7 +30,6 @@ _PART = re.compile(r"^ *(?:RIFF|riff|Riff size|data|FORM|SSND|Data Size) *: (\d+
 FELT = (20.0, 1000.0)  # Hz: what is played by default, up to where vibration is felt, or
 CARRIED = (20.0, 400.0)  # where carriers are chosen
 ENDS = 3.0  # periods of the lowest frequency: so far a kink where a recording is reflected reaches (a sine's: 0.3 %)
-GRID = 10e-6  # m: cells of a force profile; a wavelength of 0.1 mm loses 1.6 % in them
 
 Passband = tuple[float, float]
 
@@ -49,97 +48,7 @@ def _peak(values: Array, ends: int = 0) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Playback(Validated, Composable):
-    """What every recording shares: scale, carriers, and how it is read.
-
-    Its curve is over recorded seconds; a spatial one is read at (position - start) / speed.
-    """
-
-    amplitude: float | None = parameter(None, "m", above=0, most=MOST_AMPLITUDE)
-    gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
-    carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
-    spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        exactly_one(amplitude=self.amplitude, gain=self.gain)
-        if self.passband is None:
-            keep(self, passband=FELT if self.carriers is None else CARRIED)
-        low, high = self.passband or FELT
-        require(low < high, "passband", self.passband, "two rising frequencies in Hz")
-
-    @cached_property
-    def curve(self) -> Curve:
-        """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
-        values, step = self._recorded()
-        low, high = self.passband or FELT
-        if 0.5 / step <= low:
-            raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
-        high = min(high, 0.5 / step)
-        size = Curve.size(values.size, step, high)
-        if size > MOST_POINTS:
-            raise SceneError(
-                f"passband = {self.passband} Hz: {values.size * step:.3g} s up to {high:g} Hz take {size} points: must "
-                f"be <= {MOST_POINTS}; shorten the recording or lower the passband"
-            )
-        curve = Curve.band_limited(values, step, low, high)
-        peak = float(np.abs(curve.values).max())
-        if self.amplitude is None:
-            scale = float(self.gain or 0.0)
-            bound = f"m per unit of the file makes a peak of {scale * peak:.3g} m: must be <= {MOST_AMPLITUDE} m"
-            if scale * peak > MOST_AMPLITUDE:
-                raise SceneError(f"gain = {scale:g} {bound}")
-        elif peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
-            raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
-        else:
-            scale = self.amplitude / min(peak, max(_peak(values), _peak(curve.values, round(ENDS / low / curve.step))))
-        return Curve(curve.values * scale, curve.step)
-
-    def _recorded(self) -> tuple[Array, float]:
-        """Values of the file, and their step (s)."""
-        raise NotImplementedError
-
-    def _speed(self) -> float | None:
-        """Speed (m/s) at which the finger recorded it; None: it is played in time."""
-        raise NotImplementedError
-
-    def _start(self) -> float:
-        """Position (m) of the first value; the middle of the recording lies at the surface's by default."""
-        return -self.curve.length * (self._speed() or 0.0) / 2
-
-    @property
-    def spatial(self) -> bool:
-        """Whether it is read at the finger's position."""
-        return self._speed() is not None
-
-    def check(self) -> None:
-        """Read the file, so that a bad one is refused before anything plays."""
-        self.curve  # noqa: B018
-        self.bands(rate=np.inf)
-
-    def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed.
-
-        None without `carriers`: the whole waveform is played.
-        """
-        if self.carriers is None:
-            return Bands.none(spatial=self.spatial)
-        curve, chosen = self.curve, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
-        return _carriers(strongest_carriers(curve.values, 1 / curve.step, **chosen), self._speed(), rate)  # type: ignore[arg-type]
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
-        speed = self._speed()
-        if speed is None:
-            return self.curve.at(time)
-        touching = np.isfinite(position)
-        recorded = (np.where(touching, position, 0.0) - self._start()) / speed
-        return np.where(touching, self.curve.at(recorded), 0.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Recorded(_Playback):
+class Recorded(Validated, Composable):
     """Recorded samples as a texture, in time or in space; beyond its ends it runs back and forth (reflection).
 
     Parameters
@@ -178,21 +87,81 @@ class Recorded(_Playback):
     rate: float | None = parameter(None, "Hz", least=1.0, most=MOST_RATE)
     channel: int = parameter(0, least=0, most=1023)
     speed: float | None = parameter(None, "m/s", above=1e-6, most=MOST_SPEED)
+    amplitude: float | None = parameter(None, "m", above=0, most=MOST_AMPLITUDE)
+    gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
+    carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
+    spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
+    passband: Passband | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        exactly_one(amplitude=self.amplitude, gain=self.gain)
+        if self.passband is None:
+            keep(self, passband=FELT if self.carriers is None else CARRIED)
+        low, high = self.passband or FELT
+        require(low < high, "passband", self.passband, "two rising frequencies in Hz")
         exactly_one(file=self.file, samples=self.samples)
         require(self.samples is None or len(self.samples) >= 2, "samples", self.samples, ">= 2 numbers")
         bound = "left out, as the file has one" if self.samples is None else f"a number of Hz <= {MOST_RATE:g}"
         require((self.rate is None) == (self.samples is None), "rate", self.rate, bound)
 
-    def _speed(self) -> float | None:
-        return self.speed
-
-    def _recorded(self) -> tuple[Array, float]:
+    @cached_property
+    def curve(self) -> Curve:
+        """The recording inside its passband, in m over recorded seconds; reads the file at the first use."""
         if self.samples is not None and self.rate is not None:
-            return np.array(self.samples), 1 / self.rate
-        return _read_sound(str(self.file), self.channel)
+            values, step = np.array(self.samples), 1 / self.rate
+        else:
+            values, step = _read_sound(str(self.file), self.channel)
+        low, high = self.passband or FELT
+        if 0.5 / step <= low:
+            raise SceneError(f"passband = {self.passband} Hz: must start < {0.5 / step:g} Hz, half the file's rate")
+        high = min(high, 0.5 / step)
+        size = Curve.size(values.size, step, high)
+        if size > MOST_POINTS:
+            raise SceneError(
+                f"passband = {self.passband} Hz: {values.size * step:.3g} s up to {high:g} Hz take {size} points: must "
+                f"be <= {MOST_POINTS}; shorten the recording or lower the passband"
+            )
+        curve = Curve.band_limited(values, step, low, high)
+        peak = float(np.abs(curve.values).max())
+        if self.amplitude is None:
+            scale = float(self.gain or 0.0)
+            bound = f"m per unit of the file makes a peak of {scale * peak:.3g} m: must be <= {MOST_AMPLITUDE} m"
+            if scale * peak > MOST_AMPLITUDE:
+                raise SceneError(f"gain = {scale:g} {bound}")
+        elif peak <= 1e-9 * max(np.abs(values).max(), 1e-300):
+            raise SceneError(f"amplitude = {self.amplitude} m: nothing to scale between {low:g} and {high:g} Hz")
+        else:
+            scale = self.amplitude / min(peak, max(_peak(values), _peak(curve.values, round(ENDS / low / curve.step))))
+        return Curve(curve.values * scale, curve.step)
+
+    @property
+    def spatial(self) -> bool:
+        """Whether it is read at the finger's position."""
+        return self.speed is not None
+
+    def check(self) -> None:
+        """Read the file, so that a bad one is refused before anything plays."""
+        self.curve  # noqa: B018
+        self.bands(rate=np.inf)
+
+    def bands(self, rate: float) -> Bands:
+        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed.
+
+        None without `carriers`: the whole waveform is played.
+        """
+        if self.carriers is None:
+            return Bands.none(spatial=self.spatial)
+        curve, chosen = self.curve, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
+        return _carriers(strongest_carriers(curve.values, 1 / curve.step, **chosen), self.speed, rate)  # type: ignore[arg-type]
+
+    def waveform(self, time: Array, position: Array) -> Array:
+        """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
+        if self.speed is None:
+            return self.curve.at(time)
+        touching = np.isfinite(position)
+        recorded = np.where(touching, position, 0.0) / self.speed + self.curve.length / 2
+        return np.where(touching, self.curve.at(recorded), 0.0)
 
 
 def _read_sound(file: str, channel: int) -> tuple[Array, float]:
@@ -237,103 +206,3 @@ def _header_problem(sound: Any, channel: int) -> str:
     if not 1 <= sound.samplerate <= MOST_RATE:
         return f"has a rate of {sound.samplerate} Hz: must be >= 1 and <= {MOST_RATE:g} Hz"
     return "" if channel < channels else f"channel = {channel}: must be < {channels}, its number of channels"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Swipe(_Playback):
-    """The lateral force of a recorded swipe as a texture over position (see ``tribometer.load_swipe``).
-
-    Only samples in contact, sliding in the main direction, averaged in cells of 10 micrometres.
-
-    `file` is an ``.npz`` with encoder, metre_per_count, lateral_force, normal_force and rate; `gain` is in m/N; all
-    else is as for `Recorded`, in Hz at the recorded speed.
-    """
-
-    kind: ClassVar[str] = "swipe"
-    spatial: ClassVar[bool] = True  # type: ignore[misc]  # known without reading the file
-
-    file: str = checked(file_name)
-
-    def _speed(self) -> float:
-        speed = load_swipe(self.file).speed
-        if speed == 0.0:
-            name = f"file = {show(self.file)}"
-            raise SceneError(f"{name}: the finger never slides in contact: must be > 0.001 m/s")
-        return speed
-
-    def _start(self) -> float:
-        return load_swipe(self.file).force_profile(GRID)[1]
-
-    def _recorded(self) -> tuple[Array, float]:
-        speed = self._speed()
-        values, _ = load_swipe(self.file).force_profile(GRID)
-        if values.size < 2:
-            raise SceneError(f"file = {show(self.file)}: slides over {values.size * GRID} m: must be > {GRID} m")
-        return values, GRID / speed
-
-
-DEPTH = 0.5  # of the slow modulation
-LEAST_GAP = 40.0  # Hz
-
-
-@dataclass(frozen=True, kw_only=True)
-class Synthetic(Validated, Composable):
-    """A texture like a recorded one that needs no file: a few components with slowly varying amplitudes.
-
-    Without a speed it is over time.
-
-    Examples
-    --------
-    >>> Synthetic(amplitude=10e-6, components=3, carriers=3).bands(rate=5000.0).frequency.round(1).tolist()
-    [42.7, 210.4, 380.8]
-    """
-
-    kind: ClassVar[str] = "synthetic"
-
-    amplitude: float = parameter(unit="m", about="bound of their sum, never exceeded", above=0, most=MOST_AMPLITUDE)
-    speed: float | None = parameter(None, "m/s", "at which they lie at 30 to 400 Hz", above=1e-6, most=MOST_SPEED)
-    components: int = parameter(6, about="how many, at least 40 Hz apart", least=1, most=8)
-    seed: int = parameter(0, about="the same one is the same texture", most=2**32 - 1)
-    carriers: int | None = parameter(None, about="of its strongest components; None: played whole", least=1, most=8)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        bound = f"at most components = {self.components}"
-        require((self.carriers or 1) <= self.components, "carriers", self.carriers, bound)
-
-    @property
-    def spatial(self) -> bool:
-        """Whether it is read at the finger's position."""
-        return self.speed is not None
-
-    def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest components (below rate/2, `rate` in Hz); envelopes are to be analysed.
-
-        None without `carriers`: the whole waveform is played.
-        """
-        if self.carriers is None:
-            return Bands.none(spatial=self.spatial)
-        frequency, weight = _draw(self.components, self.seed)[:2]
-        return _carriers(frequency[np.sort(np.argsort(-weight)[: self.carriers])], self.speed, rate)
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Target displacement (m, shape (n,)); a spatial texture is still where `position` (m) is NaN."""
-        recorded = np.asarray(time, float) if self.speed is None else np.asarray(position, float) / self.speed
-        total = np.zeros(recorded.shape)
-        for frequency, weight, swell, phase, start in _draw(self.components, self.seed).T:
-            envelope = weight * (1 + DEPTH * np.cos(2 * np.pi * (swell * recorded + start)))
-            total += envelope * np.cos(2 * np.pi * (frequency * recorded + phase))
-        return np.where(np.isfinite(recorded), self.amplitude * total, 0.0)
-
-
-@lru_cache(maxsize=16)
-def _draw(components: int, seed: int) -> Array:
-    """Per component: frequency (Hz), weight (1), frequency of its modulation (Hz), and two phases (turns)."""
-    rng = np.random.default_rng(seed)
-    middle = np.linspace(40.0, 390.0, components) if components > 1 else np.array([200.0])
-    gap = 350.0 / max(components - 1, 1)
-    jitter = min(10.0, (gap - LEAST_GAP) / 2)
-    frequency = middle + rng.uniform(-jitter, jitter, components)
-    weight = rng.uniform(0.4, 1.0, components)
-    weight /= weight.sum() * (1 + DEPTH)
-    return np.stack([frequency, weight, rng.uniform(0.2, 0.8, components), *rng.uniform(0, 1, (2, components))])

@@ -21,8 +21,8 @@ from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
-from hapticrender.touch.motion import LONGEST_TIME, Nowhere, RecordedMotion, Sampled, SineMotion, Still, TriangleMotion
-from hapticrender.touch.recorded import Recorded, Swipe, Synthetic
+from hapticrender.touch.motion import LONGEST_TIME, Nowhere, Sampled, SineMotion, Still, TriangleMotion
+from hapticrender.touch.recorded import Recorded
 from hapticrender.touch.touch_panel import TouchPanel
 
 LONGEST_LINE = 500  # characters
@@ -48,10 +48,8 @@ class Custom(Validated):
 
 
 Kinds = dict[str, type[Any]]
-TEXTURES: Kinds = {one.kind: one for one in (Grating, Recorded, Swipe, Synthetic, Chirp, Sum, Playlist, Custom)}
-MOTIONS: Kinds = {
-    one.kind: one for one in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, RecordedMotion, Custom)
-}
+TEXTURES: Kinds = {one.kind: one for one in (Grating, Recorded, Chirp, Sum, Playlist, Custom)}
+MOTIONS: Kinds = {one.kind: one for one in (Nowhere, Still, TriangleMotion, SineMotion, Sampled, Custom)}
 TABLES = {  # field of a scene: table of a file
     "profile": "device",
     "limits": "limits",
@@ -188,10 +186,9 @@ class Scene(Validated):
         """Read a scene from TOML; `where` begins every message, `folder` holds the files, `name` is the default."""
         with naming(where):
             scene = _read_scene(toml_text.loads(text), Path(folder), name)
-            for key, part in (("texture", scene.texture), ("finger", scene.finger.motion)):
-                if hasattr(part, "check"):
-                    with checks.inside(key):
-                        part.check()
+            if hasattr(scene.texture, "check"):
+                with checks.inside("texture"):
+                    scene.texture.check()
         return scene
 
     def to_toml(self) -> str:
@@ -302,8 +299,6 @@ def _read_finger(table: Any, folder: Path) -> Finger:
     own = [entry.name for entry in fields(Finger) if entry.name != "motion"]
     motion = _read_kind(table, "finger", "motion", MOTIONS, folder, extra=own)
     values = {key: table[key] for key in own if key in table}
-    if isinstance(motion, RecordedMotion):
-        values.setdefault("normal_load", None)
     with checks.inside("finger"):
         return Finger(motion, **values)
 
