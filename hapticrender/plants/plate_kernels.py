@@ -24,7 +24,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, I8, SIGNALS_T, CFunction, call, kernel, pointer, step
+from hapticrender.jit import F8, I8, SIGNALS_T, CFunction, call, kernel, pointer, record, step
 from hapticrender.plants.compiled import SENSOR_CLIPPED, quantise, queue_drive
 
 STATES, COLUMNS = 8, 11  # of [Phi Gamma], which is kept column by column
@@ -107,7 +107,7 @@ def times(matrix, w, out):
 @partial(CFunction, signature=I8(I8, F8, F8))
 def assemble(state, lever, strength):
     """Fill [A B] for a finger at a lever arm; the mass matrix is inverted by the formula of Sherman and Morrison."""
-    s = carray(pointer(state, PLATE_T), 1)[0]
+    s = record(state, PLATE_T, 0)
     h, f, w, d, own = s.glass, s.tissue, s.moved, s.inverse_mass, s.force
     h[0], h[1], h[2], h[3] = 1.0, lever, bending_shape(s, lever), 0.0
     response = 0.0
@@ -134,7 +134,7 @@ def assemble(state, lever, strength):
 @partial(CFunction, signature=I8(I8))
 def sum_series(state):
     """Add (1 + A/2! + A^2/3! + ...) term to `total`, to rounding."""
-    s = carray(pointer(state, PLATE_T), 1)[0]
+    s = record(state, PLATE_T, 0)
     scale = 0.0
     for i in range(STATES):
         scale = max(scale, max(abs(s.total[i]), abs(s.term[i])))
@@ -154,7 +154,7 @@ def sum_series(state):
 @partial(CFunction, signature=I8(I8, I8, F8, F8))
 def fill(state, node, lever, strength):
     """Compute [Phi Gamma] for a lever arm and a strength as entry `node` of the table."""
-    s = carray(pointer(state, PLATE_T), 1)[0]
+    s = record(state, PLATE_T, 0)
     call(s.assemble, (state, lever, strength))
     for j in range(s.columns):
         for i in range(STATES):
@@ -169,7 +169,7 @@ def fill(state, node, lever, strength):
 @partial(CFunction, signature=I8(I8, F8, F8))
 def slide(state, lever, strength):
     """Advance the states by the table, interpolated at a lever arm."""
-    s = carray(pointer(state, PLATE_T), 1)[0]
+    s = record(state, PLATE_T, 0)
     place = lever * s.nodes_per_lever
     node = min(max(int(place + 0.5 * NODES), 1), NODES - 2)
     for k in range(node - 1, node + 2):
@@ -188,7 +188,7 @@ def slide(state, lever, strength):
 @partial(CFunction, signature=I8(I8, F8, F8))
 def advance(state, lever, strength):
     """Advance the states by one sample under the inputs in `w`."""
-    s = carray(pointer(state, PLATE_T), 1)[0]
+    s = record(state, PLATE_T, 0)
     same = strength == s.strength
     s.rest = s.rest + 1 if same and lever == s.lever else 0
     s.lever, s.strength = lever, strength
@@ -220,8 +220,8 @@ def plate_step(state, signals, start, count):
     Motion is the displacement (m) of centre, end 1 and end 2, then the velocity (m/s) of the glass under the finger,
     while lifted under its middle.
     """
-    s = carray(pointer(state, PLATE_T), 1)[0]
-    io = carray(pointer(signals, SIGNALS_T), 1)[0]
+    s = record(state, PLATE_T, 0)
+    io = record(signals, SIGNALS_T, 0)
     stop, channels = start + count, s.channels
     drive = carray(pointer(io.drive, F8), (stop, channels))
     inputs = carray(pointer(io.inputs, F8), (stop, 4))
