@@ -63,12 +63,15 @@ class HybridDriver(WrappedDriver):
     (2, 2) is heave (m) and tilt (rad) per sensor; velocity, a difference of two samples, waits for the friction.
     """
 
+    calls_back = True
+
     def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
         super().__init__(driver)
         self.shape, self.motion_delay = shape, max(late, 0.5 / self.rate)  # s, of `motion`
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
         self._waits = self.motion_delay * self.rate - 0.5  # samples, as a difference is half a sample late
-        self._last = np.zeros((math.ceil(self._waits) + 1, 2))
+        self.early = math.ceil(self._waits) + 1  # samples before those whose velocity is computed
+        self._last = np.zeros((self.early, self.sensed_channels))
 
     def play(self, drive: Array) -> Sensed:
         """Play a block, the screen's drive as a current."""
@@ -77,15 +80,19 @@ class HybridDriver(WrappedDriver):
         sensed = self.put(drive)
         if sensed.motion is not None or not self.sensed_channels:
             return sensed
-        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-            values = np.asarray(sensed.sensed, float)
-            glass = np.vstack([self._last, values[:, :SENSORS] @ self.displacement.T])
-            kept, self._last = len(self._last) - 1, glass[-len(self._last) :]
-            rates = on_time(self.rate * np.diff(glass, axis=0), len(values), kept - self._waits)
-            place = np.zeros(len(values)) if sensed.position is None else np.nan_to_num(sensed.position)
-            skin = rates[:, 0] + place * rates[:, 1] + self.velocity_per_force * values[:, SENSORS]
+        place = np.zeros(len(sensed.sensed)) if sensed.position is None else sensed.position
+        values = np.vstack([self._last, sensed.sensed])
+        self._last = values[-self.early :]
+        return sensed._replace(motion=self.skin(values, np.pad(place, (self.early, 0)))[self.early :])
+
+    def skin(self, sensed: Array, position: Array) -> Array:
+        """Velocity of the skin (m/s, shape (n, 1)), from the sensors, `motion_delay` late; less the first `early`."""
         self.motion_source = "sensors"
-        return sensed._replace(motion=skin[:, None])
+        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
+            glass = sensed[:, :SENSORS] @ self.displacement.T
+            rates = on_time(self.rate * np.diff(glass, axis=0, prepend=glass[:1]), len(glass), -self._waits)
+            skin = rates[:, 0] + np.nan_to_num(position) * rates[:, 1] + self.velocity_per_force * sensed[:, SENSORS]
+        return skin[:, None]
 
 
 @dataclass(frozen=True)
