@@ -119,7 +119,7 @@ class Player(Addressed):
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
-        self._loop: Any = None  # a `LiveLoop`, or that of a board, once something plays
+        self._loop: LiveLoop | Any = None  # or that of a board, with its interface; None: nothing plays yet
         self._gain, self._lost, self._raised = 1.0, 0, False
         self._error: BaseException | None = None
         self._recorder: Recorder | None = None
@@ -302,7 +302,7 @@ class Player(Addressed):
             with self._lock:
                 self._check()
 
-    def _playing(self, what: str) -> Any:
+    def _playing(self, what: str) -> LiveLoop | Any:
         if self._loop is None:
             raise ValueError(f"{what}: nothing plays yet: call play first")
         return self._loop
