@@ -97,9 +97,9 @@ def unplug(sensed):
 
 
 FAULTS = {  # what is sensed then, and what is raised
-    "dead": (lambda sensed: 0.0 * sensed, hr.DeviceFault, "one value repeats|the friction jumped"),
+    "dead": (lambda sensed: 0.0 * sensed, hr.DeviceFault, "one value repeats|jumped from one sample"),
     "no numbers": (lambda sensed: np.nan * sensed, hr.DeviceFault, "are no numbers"),
-    "gain of 3": (lambda sensed: 3.0 * sensed, hr.DeviceFault, "the drive stayed above|jumped|does not follow"),
+    "gain of 3": (lambda sensed: 3.0 * sensed, hr.DeviceFault, "jumped from one sample|does not follow"),
     "application hangs": (lambda sensed: sensed, hr.WatchdogTimeout, f"for {HANG} s"),
 }
 
