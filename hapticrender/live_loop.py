@@ -199,6 +199,9 @@ class LiveLoop(RealtimeEntry):
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
         whole = self.whole and self.controller.n_bands == 0
+        bands = rendering.bands
+        if isinstance(bands, CombinedBands) and whole != (bands.envelope is None and not len(bands)):
+            raise ValueError("texture: a hybrid changes to, or from, a whole waveform in a new Player only")
         return self._texture(rendering), self.controller if whole else live_controller(rendering)
 
     def replace(self, rendering: Rendering, texture: SampledTexture | EvaluatedTexture, controller: Controller) -> None:

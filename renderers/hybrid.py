@@ -6,7 +6,8 @@ shares of both sum to one at every frequency: the screen's is
     s(f) = e(f/F - 1),   e(x) = x^2 (3 - 2 x) from 0 to 1,
 
 0 below F and 1 above 2 F, half at the crossover 1.5 F, and the plate's is 1 - s.  Of carriers that follow the finger
-each bank takes its share while the frequency goes up and down, by the fades that end its range.
+each bank takes its share while the frequency goes up and down, by the fades that end its range.  A whole waveform,
+without carriers, is the plate's alone.
 """
 
 import math
@@ -189,7 +190,7 @@ class HybridRenderer(BaseRenderer):
         bands = setup.bands
         check_carriers(setup.scene, model, bands)
         require(isinstance(model, CombinedModel), "model", model, "the CombinedModel of device_model", TypeError)
-        if len(bands.plate):
+        if len(bands.plate) or bands.plate.envelope is None:
             bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
         if model.friction is not None and setup.friction is not None:
             bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
@@ -221,8 +222,8 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
     """Bands of a scene, and the share of each part as displacement (m)."""
     whole = perceptible(scene, scene.texture.bands(rate), plate.device_model(rate, 1))
     locked = whole.wavenumber > 0.0
-    if whole.envelope is None and not locked.all():
-        raise ValueError("texture: a recording over time is not supported on a hybrid: use one over position")
+    if whole.envelope is None and not locked.all():  # with carriers; without any the plate plays all of it
+        raise ValueError("texture: a recording over time on carriers is not supported on a hybrid: leave out carriers")
     high = settings.share_of_screen(whole.frequency)
     parts: dict[str, Any] = {}
     for name, own in (("plate", 1.0 - high), ("friction", high)):

@@ -13,7 +13,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController, refuse_whole_waveform
+from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, TILE_T, W
 from hapticrender.control.supervisor import Fault, SupervisedController, supervised
@@ -80,7 +80,7 @@ def combined_step(state, signals, start, count):
                 for s in range(p.sensors):
                     own[m, s] = sensed[first + m, sensor + s]
                 place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
-            if p.bands > 0:
+            if p.step != 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for k in range(MOST_CHANNELS):
                 p.heat[k] *= p.heat_decay
@@ -117,6 +117,8 @@ class CombinedController(Addressed):
         self.method, self.parts, self.bands, self.n_bands = method, parts, bands, len(bands)
         self.step, self.part_channels = combined_step, channels
         self.channels, self.sensors = sum(channels), sum(sensors)
+        whole = bands.envelope is None and not len(bands)  # and the plate's alone
+        self.lookahead = int(getattr(parts[0], "lookahead", 0)) if whole else 0
         self.rate = next((part.rate for part in parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in parts)
         self.state = record_of(COMBINED, self, bands=self.n_bands)
@@ -181,13 +183,20 @@ class CombinedController(Addressed):
 def design_combined(
     method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True
 ) -> CombinedController:
-    """Design a controller of `method` for each part, with its share of the targets; open loop without feedback."""
-    refuse_whole_waveform(bands, "a hybrid", "recordings over position")
+    """Design a controller of `method` for each part, with its share of the targets; open loop without feedback.
+
+    A whole waveform is the plate's alone: a ValueError where `bands` do not share it out, or the method cannot.
+    """
+    if not isinstance(bands, CombinedBands):
+        raise ValueError("bands: must be CombinedBands, which share out what a device of two parts plays")
+    whole = bands.envelope is None and not len(bands)
     models, shares = (model.plate, model.friction), (bands.plate, bands.friction)
     parts: list[Any] = []
     for each, own in zip(models, shares, strict=True):
-        part: Any = method.design(each, own, feedback=feedback) if each is not None and len(own) else None
-        parts.append(part if part is None or each is None else supervised(part, each, feedback=feedback))
+        part: Any = None
+        if each is not None and (len(own) or (whole and each is model.plate)):
+            part = supervised(method.design(each, own, feedback=feedback), each, feedback=feedback)
+        parts.append(part)
     sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
     channels = (model.plate.force_from_drive.shape[1], 1)
     heat_decay = math.exp(-1.0 / (model.plate.rms_time * model.rate)), 1.0  # limits of rms drive are the plate's
