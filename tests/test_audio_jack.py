@@ -370,7 +370,7 @@ def test_a_screen_is_played_by_the_compiled_callback(connected, tmp_path):
     time.sleep(0.05)
     friction = device.recorded(tmp_path / "record")[0][:, 0] * jack_ring.FRICTION
     assert friction[-1] == pytest.approx(0.8 * load, rel=1e-3)  # of the load alone
-    assert friction.max() > 1.5 * friction[-1]
+    assert friction.max() > friction[-1] + 2 * abs(wanted)  # the bias is headroom for twice the texture
 
 
 @pytest.mark.parametrize(
