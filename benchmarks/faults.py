@@ -1,6 +1,6 @@
 """Inject faults of sensors and coils into a plate that the library does not know, while a texture plays.
 
-Run: python -m benchmarks.faults [--plate other] [--place MM] [--tones] [--card | --blocks] [fault ...]
+Run: python -m benchmarks.faults [--plate other] [--place MM | --slides] [--tones] [--card | --blocks] [fault ...]
 
 The plate is that of ``tests/strangers_plate.py`` with mass, springs, damping and sensor gains off by 2 to 20 %, a
 bending mode at 1250 Hz, contact reported 5 ms late, and a delay of 2 samples, which is stated; ``--plate other`` takes
@@ -8,8 +8,10 @@ that of ``tests/other_plate.py``, whose parameters are what the library takes fo
 stranger's plate takes blocks of 64 at 48 kHz, as behind a sound card, and is one sample later than stated; with
 ``--blocks`` it takes blocks of 25 at 5 kHz, and is one sample later than stated, too.
 Printed for every fault, over 10 and 50 um, without and with a heavy finger of 0.8 N on the middle, or `--place` (mm)
-off it, then with 0.8 and 2 N: the time from the fault to the stop, how many runs stopped, the largest drive and the
-largest true motion of an end.  Textures are a tone of 20, 72, 189 or 400 Hz; with ``--tones`` one of 60 and 144 Hz.
+off it, then with 0.8 and 2 N (with `--slides`, on the stranger's plate, it rests on the middle until 0.4 s after the
+fault, then slides to 45 mm at 80 mm/s): the time from the fault to the stop, how many runs stopped, the largest
+drive and the largest true motion of an end.  Textures are a tone of 20, 72, 189 or 400 Hz; with ``--tones`` one of 60
+and 144 Hz.
 """
 
 import argparse
@@ -74,6 +76,11 @@ class FaultyWrongPlate(FaultyPlate, StrangersPlate):
     def ends(self):
         """Displacement of both (m) at every sample."""
         return self.truth[:, 1:3]
+
+
+def off_the_middle(time):
+    """Position (m) of a finger that slides from the middle to 45 mm, 0.4 s after the fault."""
+    return np.clip(0.08 * (time - START - 0.4), 0.0, 0.045)
 
 
 def only_first(change):
@@ -146,19 +153,22 @@ def main():
     ways = parser.add_mutually_exclusive_group()
     ways.add_argument("--card", action="store_true", help="48 kHz, in blocks of 64, on the stranger's plate")
     ways.add_argument("--blocks", action="store_true", help="5 kHz, in blocks of 25, on the stranger's plate")
-    parser.add_argument("--place", type=float, default=0.0, help="of the finger (mm)")
+    places = parser.add_mutually_exclusive_group()
+    places.add_argument("--place", type=float, default=0.0, help="of the finger (mm)")
+    places.add_argument("--slides", action="store_true", help="it slides off the middle, on the stranger's plate")
     arguments = parser.parse_args()
     if unknown := set(arguments.faults) - set(FAULTS):
         parser.error(f"{', '.join(sorted(unknown))}: must be of {', '.join(FAULTS)}")
     if abs(arguments.place) > 1e3 * REACH:
         parser.error(f"--place {arguments.place:g} mm: must be within {1e3 * REACH:g}, the ends of the plate")
-    loads = (0.8, 2.0) if arguments.place else (0.0, 0.8)
+    loads = (0.8, 2.0) if arguments.place or arguments.slides else (0.0, 0.8)
+    place = off_the_middle if arguments.slides else 1e-3 * arguments.place
     changes = CARD if arguments.card else BLOCKS if arguments.blocks else {}
     textures = [TONES] if arguments.tones else [{"frequency": each} for each in FREQUENCIES]
     for fault, texture in product(arguments.faults or FAULTS, textures):
         runs = [
             run(
-                PLATES[arguments.plate](*FAULTS[fault], load, 1e-3 * arguments.place, **changes),
+                PLATES[arguments.plate](*FAULTS[fault], load, place, **changes),
                 hr.Grating(amplitude=a, **texture),
             )
             for a, load in product((10e-6, 50e-6), loads)

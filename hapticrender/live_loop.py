@@ -106,6 +106,8 @@ class LiveLoop(RealtimeEntry):
         own = rendering.plant is not None
         self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_lag), 0  # of the samples before this one
+        if self._calls_back and rendering.driver is not rendering.device:
+            self.set_root(rendering.shape)
         self.play(self._texture(rendering))
 
     @property
@@ -197,6 +199,9 @@ class LiveLoop(RealtimeEntry):
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
         whole = self.whole and self.controller.n_bands == 0
+        bands = rendering.bands
+        if isinstance(bands, CombinedBands) and whole != (bands.envelope is None and not len(bands)):
+            raise ValueError("texture: a hybrid changes to, or from, a whole waveform in a new Player only")
         return self._texture(rendering), self.controller if whole else live_controller(rendering)
 
     def replace(self, rendering: Rendering, texture: SampledTexture | EvaluatedTexture, controller: Controller) -> None:
@@ -214,7 +219,9 @@ class LiveLoop(RealtimeEntry):
         if controller is not self.controller:
             ready(controller)
         self.play(texture, controller)
-        if rendering.shape is not None:
+        if rendering.shape is not None and self._calls_back:
+            self.set_root(rendering.shape)
+        elif rendering.shape is not None:
             self._reshaping = self._device.shape, rendering.shape, self.samples
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
         self.model = model
@@ -222,10 +229,12 @@ class LiveLoop(RealtimeEntry):
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Signals of a recording from sample `start` on, as far back as they are kept, and the first one's number."""
         derived = self.rendering.differentiated  # by central differences: a sample before, and one after
-        found = self.log(start - 1 if derived else start)
+        found = self.log(start - getattr(self.driver, "early", 1) if derived else start)
         first = int(found.pop("first"))
+        if self._calls_back and hasattr(self.driver, "skin") and self.driver.sensed_channels:
+            self._has_motion, found["motion"] = True, self.driver.skin(found["sensed"], found["position"])
         if derived:
-            enough, skip = len(found["flags"]) > 2, int(first == start - 1)
+            enough, skip = len(found["flags"]) > 2, max(start - first, 0)
             found["reference"] = np.gradient(found["reference"]) * self.driver.rate if enough else found["reference"]
             rows = slice(skip, -1 if enough else skip)
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
@@ -235,7 +244,7 @@ class LiveLoop(RealtimeEntry):
         found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
         stated = {"motion": true[:, :-1]} if self._has_motion else {}
         contact = self._contact if first == self._followed else ContactLag(self.model.contact_lag)
-        motion = motion_of(self.driver, self.model, found | stated, contact)
+        motion = motion_of(self.driver, self.model, stated | found, contact)
         if first >= self._followed:
             self._contact, self._followed = contact, first + len(motion)
         found = {name: signal[: len(motion)] for name, signal in found.items()}
@@ -280,6 +289,12 @@ class LiveLoop(RealtimeEntry):
             if self._calls_back:  # by a callback without Python's lock
                 return ForeseenTexture(rendering, self.ahead, self.foreseen(sampled_texture.PIECE)[1])
         return EvaluatedTexture(rendering, self.ahead, self._arrays["places"], self._arrays["position"])
+
+
+def is_called_back(rendering: Rendering) -> bool:
+    """Return whether the device calls the controller back, and what is before it is compiled."""
+    direct = rendering.driver is rendering.device
+    return hasattr(rendering.device, "start") and bool(getattr(rendering.driver, "calls_back", direct))
 
 
 def live_controller(rendering: Rendering) -> Controller:

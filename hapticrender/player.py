@@ -5,8 +5,8 @@
         player.finger(position=0.01, velocity=0.08, load=0.4)
 
 Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back
-(`start`, `stop`) is handed it as its callback, on plates; one whose controller runs on the device (`loop`) brings its
-own; any other, or what is behind a renderer's own conversion of the drive, is played by a thread.
+(`start`, `stop`) is handed it as its callback; one whose controller runs on the device (`loop`) brings its own; any
+other, or what is behind a carrier that Python makes, is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
 Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.
@@ -32,7 +32,7 @@ from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
-from hapticrender.live_loop import LiveLoop, LiveMotion
+from hapticrender.live_loop import LiveLoop, LiveMotion, is_called_back
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
 from hapticrender.loop import FADE_OUT, opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_state import BandState, PlayerState
@@ -119,7 +119,7 @@ class Player(Addressed):
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
         self._finger: tuple[float, float, float] | None = None  # position, velocity and load that were set,
         self._finger_time = 0.0  # and when
-        self._loop: Any = None  # a `LiveLoop`, or that of a board, once something plays
+        self._loop: LiveLoop | Any = None  # or that of a board, with its interface; None: nothing plays yet
         self._gain, self._lost, self._raised = 1.0, 0, False
         self._error: BaseException | None = None
         self._recorder: Recorder | None = None
@@ -302,7 +302,7 @@ class Player(Addressed):
             with self._lock:
                 self._check()
 
-    def _playing(self, what: str) -> Any:
+    def _playing(self, what: str) -> LiveLoop | Any:
         if self._loop is None:
             raise ValueError(f"{what}: nothing plays yet: call play first")
         return self._loop
@@ -348,7 +348,7 @@ class Player(Addressed):
         live = driver.live() if hasattr(driver, "live") else driver
         try:
             rendering = prepare(scenes[0], driver=live)
-            if live is not driver and rendering.driver is not live:  # which a thread plays, later than a callback
+            if live is not driver and not is_called_back(rendering):  # a thread plays it, later than a callback
                 rendering = prepare(scenes[0], driver=driver)
             return self._start(rendering, scenes[1:])
         except BaseException as error:
@@ -359,8 +359,8 @@ class Player(Addressed):
     def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:
         """Open the device at rest, probe it, prepare what plays later, and play."""
         device: Any = rendering.device
-        stack, direct = self._stack, rendering.driver is device
-        calls_back, own = direct and hasattr(device, "start"), direct and hasattr(device, "loop")
+        stack, calls_back = self._stack, is_called_back(rendering)
+        own = rendering.driver is device and hasattr(device, "loop")
         self._clocked = calls_back or own
         blocks = 2 * rendering.driver.block / rendering.driver.rate
         self._timeout = TIMEOUT + blocks

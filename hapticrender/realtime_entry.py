@@ -117,7 +117,7 @@ class RealtimeEntry(Addressed):
         require(self.frames > 0 and self.frames % self.block == 0, "frames", frames, bound)
         self.whole = controller.bands.envelope is None
         self._slot, self._slots, self._back = np.zeros(1, SLOT), np.zeros(SLOTS, SLOT), 0
-        self._slot["position"], self._slot["playing"], self._slot["gain"] = np.nan, 1, 1.0
+        self._slot["position"], self._slot["playing"], self._slot["gain"], self._slot["root_gain"] = np.nan, 1, 1.0, 1.0
         self._slots[:] = self._slot
         self._textures: list[SampledTexture | EvaluatedTexture] = []
         self._writing = threading.Lock()  # of threads of the application; the callback never waits
@@ -248,6 +248,17 @@ class RealtimeEntry(Addressed):
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
         self._set(gain=number("gain", gain))
+
+    def set_root(self, root: Any) -> None:
+        """Let the last channel be the peak of a screen's carrier (A), by its `SquareRoot`; None: none yet, zero.
+
+        First before the entry is called, which then has no drive at rest, and of a screen alone senses magnitudes;
+        another bias is reached within `FADE`, a smaller one is not taken.
+        """
+        if root is not None:
+            self._set(bias=root.bias, floor=root.floor / root.bias, root_gain=root.gain, straight=root.straight)
+            self._entry["bias"] = self._entry["bias"] if self._entry["rooted"][0] else root.bias
+        self._entry["rooted"] = 1
 
     def watch(self, seconds: float | None = None) -> None:
         """Stop the drive permanently once neither this nor `alive` has been called for so long (s); None: never."""

@@ -25,11 +25,13 @@ F4 = types.float32
 SLOT = np.dtype(
     [
         *((name, np.float64) for name in ("position", "velocity", "load", "gain", "watchdog")),
-        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls")),
+        *((name, np.float64) for name in ("bias", "floor", "root_gain")),
+        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls", "straight")),
     ]
 )
-"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), whether anything plays,
-the texture's record; how often it has set the finger, and called."""
+"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), the square root of a
+screen (its floor over its bias), whether anything plays, the texture's record; how often it has set the finger, and
+called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
 CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "analysed", "shared", "limit_at")])
 """Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
@@ -40,9 +42,9 @@ _ADDRESSES = (
     "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
     "tracker"
 )
-_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken"
+_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken rooted"
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
-_STATE = "gain touch place pace offset offset_input lead lead_input open"
+_STATE = "gain touch place pace offset offset_input lead lead_input open bias level"
 _SETTINGS = "rate sensed_scale drive_scale fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
@@ -278,6 +280,22 @@ def stop(entry):
 
 
 @kernel
+def take_root(entry, slot):
+    """Turn the drive of the last channel (N) into the peak of a carrier (A), by the square root around a bias.
+
+    The bias rises within `fade` and never falls; at rest the peak fades, as zero drive is the bias.
+    """
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
+    drive = carray(pointer(e.drive_at, F8), (e.block, e.channels))[:, e.channels - 1]
+    rests = e.stopped >= 0 or s.playing == 0
+    for m in range(e.block):
+        e.bias = max(e.bias, min(e.bias + s.bias / e.fade, s.bias))
+        e.level = max(e.level - e.closing_step, 0.0) if rests else 1.0
+        attraction = max(e.bias + drive[m], s.floor * e.bias) / s.root_gain
+        drive[m] = e.level * (attraction / np.sqrt(2 * e.bias / s.root_gain) if s.straight > 0 else np.sqrt(attraction))
+
+
+@kernel
 def keep(entry, slot):
     """Copy entry and slot between two blocks, for `foresee`."""
     e = record(entry, ENTRY_T, 0)
@@ -312,6 +330,8 @@ def advance(entry):
         drive[:] = 0.0
     raised = stop(entry)
     write_log(entry, slot)
+    if e.rooted > 0:
+        take_root(entry, slot)
     e.flags |= raised
     swap(entry + SAMPLES_AT, e.samples + e.block)  # the log's rows are there for whoever reads the count
     keep(entry, slot)
@@ -333,6 +353,8 @@ def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
     for block in range(count // e.block):
         for i in range(inputs):
             own[i] = sensed_scale * given[block * inputs + i]
+        if e.rooted > 0 and e.channels == 1:
+            own[:] = np.abs(own)  # friction, of a tribometer that keeps the sign of the lateral force
         raised |= advance(entry)
         for i in range(outputs):
             out[block * outputs + i] = drive_scale * result[i]

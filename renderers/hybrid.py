@@ -2,7 +2,8 @@
 
 The target quantity is the velocity of the skin (m/s), to which both add [Grigorii et al. 2021, who propose it].  The
 shares of both sum to one at every frequency (docs/theory.md, "Hybrid").  Of carriers that follow the finger each bank
-takes its share while the frequency goes up and down, by the fades that end its range.
+takes its share while the frequency goes up and down, by the fades that end its range.  A whole waveform, without
+carriers, is the plate's alone.
 """
 
 import math
@@ -59,12 +60,15 @@ class HybridDriver(WrappedDriver):
     (2, 2) is heave (m) and tilt (rad) per sensor; velocity, a difference of two samples, waits for the friction.
     """
 
+    calls_back = True
+
     def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
         super().__init__(driver)
         self.shape, self.motion_delay = shape, max(late, 0.5 / self.rate)  # s, of `motion`
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
         self._waits = self.motion_delay * self.rate - 0.5  # samples, as a difference is half a sample late
-        self._last = np.zeros((math.ceil(self._waits) + 1, 2))
+        self.early = math.ceil(self._waits) + 1  # samples before those whose velocity is computed
+        self._last = np.zeros((self.early, self.sensed_channels))
 
     def play(self, drive: Array) -> Sensed:
         """Play a block, the screen's drive as a current."""
@@ -73,15 +77,19 @@ class HybridDriver(WrappedDriver):
         sensed = self.put(drive)
         if sensed.motion is not None or not self.sensed_channels:
             return sensed
-        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
-            values = np.asarray(sensed.sensed, float)
-            glass = np.vstack([self._last, values[:, :SENSORS] @ self.displacement.T])
-            kept, self._last = len(self._last) - 1, glass[-len(self._last) :]
-            rates = on_time(self.rate * np.diff(glass, axis=0), len(values), kept - self._waits)
-            place = np.zeros(len(values)) if sensed.position is None else np.nan_to_num(sensed.position)
-            skin = rates[:, 0] + place * rates[:, 1] + self.velocity_per_force * values[:, SENSORS]
+        place = np.zeros(len(sensed.sensed)) if sensed.position is None else sensed.position
+        values = np.vstack([self._last, sensed.sensed])
+        self._last = values[-self.early :]
+        return sensed._replace(motion=self.skin(values, np.pad(place, (self.early, 0)))[self.early :])
+
+    def skin(self, sensed: Array, position: Array) -> Array:
+        """Velocity of the skin (m/s, shape (n, 1)), from the sensors, `motion_delay` late; less the first `early`."""
         self.motion_source = "sensors"
-        return sensed._replace(motion=skin[:, None])
+        with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
+            glass = sensed[:, :SENSORS] @ self.displacement.T
+            rates = on_time(self.rate * np.diff(glass, axis=0, prepend=glass[:1]), len(glass), -self._waits)
+            skin = rates[:, 0] + np.nan_to_num(position) * rates[:, 1] + self.velocity_per_force * sensed[:, SENSORS]
+        return skin[:, None]
 
 
 @dataclass(frozen=True)
@@ -178,7 +186,7 @@ class HybridRenderer(BaseRenderer):
         bands = setup.bands
         check_carriers(setup.scene, model, bands)
         require(isinstance(model, CombinedModel), "model", model, "the CombinedModel of device_model", TypeError)
-        if len(bands.plate):
+        if len(bands.plate) or bands.plate.envelope is None:
             bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
         if model.friction is not None and setup.friction is not None:
             bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
@@ -210,8 +218,8 @@ def _share_out(scene: Scene, settings: HybridSettings, plate: PlateParameters, r
     """Bands of a scene, and the share of each part as displacement (m)."""
     whole = perceptible(scene, scene.texture.bands(rate), plate.device_model(rate, 1))
     locked = whole.wavenumber > 0.0
-    if whole.envelope is None and not locked.all():
-        raise ValueError("texture: a recording over time is not supported on a hybrid: use one over position")
+    if whole.envelope is None and not locked.all():  # with carriers; without any the plate plays all of it
+        raise ValueError("texture: a recording over time on carriers is not supported on a hybrid: leave out carriers")
     high = settings.share_of_screen(whole.frequency)
     parts: dict[str, Any] = {}
     for name, own in (("plate", 1.0 - high), ("friction", high)):

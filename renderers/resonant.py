@@ -1,6 +1,7 @@
 """A user's resonant plate as a driver of friction, through the friction law and the amplitude's own controller."""
 
 import math
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import Demand
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.control.methods import method_named
-from hapticrender.control.supervisor import Fault, supervised
+from hapticrender.control.supervisor import JUMP, Fault, supervised
 from hapticrender.driver_checks import check_channels, check_sensed
 from hapticrender.plants.compiled import LOAD, SPEED, finger_inputs
 from hapticrender.plants.friction_laws import friction_ratios, reference_amplitudes
@@ -21,6 +22,7 @@ from hapticrender.protocols import Array, Driver, Flag, Sensed
 from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
+SIGMAS, DRIVE_ERROR = 8.0, 2.0  # of noise; of the force that the drive may make, over that assumed
 LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % at half as much again
 
 
@@ -70,11 +72,14 @@ class ResonantDriver(WrappedDriver):
         self._load = math.nan  # N: that the device has last measured
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
+        self._last = np.full(2, np.nan)  # m: the last two samples
+        self._peaks = deque([0.0], maxlen=2 + driver.delay // driver.block)  # V: of the blocks that act
+        self._jumped: Fault | None = None
 
     @property
     def fault(self) -> Fault | None:
         """Why the drive of the amplitude has been stopped; see `control.supervisor`."""
-        return getattr(self._supervised, "fault", None)
+        return self._jumped or getattr(self._supervised, "fault", None)
 
     def play(self, drive: Array) -> Sensed:
         """Play a block of friction (N); sample i of what is sensed was there at the start of interval i."""
@@ -134,15 +139,39 @@ class ResonantDriver(WrappedDriver):
             at = start % long
             if at == 0:
                 played.append(check_sensed(self.driver, self.put(self._drive), 1))
+                self._peaks.append(abs(self._drive).max())
+                if self._jumped is None and self.sensed_channels and self._jumps(played[-1]):
+                    self._jumped = Fault(JUMP, self._samples, 1)
             here = slice(at, at + step)
             sensed = played[-1].sensed[here] if self.sensed_channels else silent
             self._next[here], _, raised = self._supervised.run(sensed, away, target[start : start + step])
             flags[start : start + step] |= raised
+            if self._jumped is not None:
+                self._next[here], flags[start : start + step] = 0.0, Flag.STOPPED
             if at + step == long:
                 self._drive = self._next.copy()
             if (start + step) % many == 0:
                 measured[start // many] = abs(complex(*observed_envelope(self.loop.state.ctypes.data)))
         return measured, played
+
+    def _jumps(self, sensed: Sensed) -> bool:
+        """Whether the sensor has jumped: ``e = y_n - 2 cos(w T) y_n-1 + y_n-2`` is 0 in a steady vibration.
+
+        A drive u adds N u T^2/m at most, and what decays w T/Q of the amplitude, 1/9 where a finger damps most.  A gain
+        that changes by g makes (g - 1) y_n, then (1 - g) y_n-1, of which one is at least |g - 1| sin(w T/2) of it; half
+        of that for 1/3 is the bound.  Nothing is compared where a converter holds its values, or samples were lost.
+        """
+        mode, lost = self.parameters.mode, sensed.flags is not None and bool((sensed.flags & Flag.OVERRUN).any())
+        y = np.r_[np.full(2, np.nan) if lost else self._last, sensed.sensed[:, 0]]
+        self._last, turn = y[-2:], 2 * np.pi * mode.frequency / self.driver.rate
+        twice = 2 * math.cos(turn)
+        noise = SIGMAS * math.sqrt(2 + twice**2) * (mode.sensor_noise + mode.sensor_step)
+        driven = DRIVE_ERROR * mode.force_constant * max(self._peaks) / (mode.modal_mass * self.driver.rate**2)
+        with np.errstate(invalid="ignore"):  # no numbers are the supervisor's
+            squares = y[1:-1] ** 2 + y[:-2] ** 2 - twice * y[1:-1] * y[:-2]
+            bound = noise + driven + math.sin(turn / 2) / 3 * np.sqrt(np.maximum(squares, 0.0)) / abs(math.sin(turn))
+            moves = (y[2:] != y[1:-1]) & (y[1:-1] != y[:-2])
+            return bool((moves & (abs(y[2:] - twice * y[1:-1] + y[:-2]) > bound)).any())
 
     def _sensed(self, friction: Array, played: list[Sensed], flags: Array) -> Sensed:
         """Measurements of the finger and flags, once a sample of friction; the mode's motion is left out."""

@@ -34,6 +34,7 @@ class WrappedDriver:
 
     motion_source = "true"  # of the motion that `play` returns, where it does
     resting = False  # set by the loop from a stop on
+    calls_back = False  # whether a `RealtimeEntry` with the square root converts the drive as `play` does
 
     def __init__(self, driver: Driver) -> None:
         self.driver = driver
@@ -74,6 +75,8 @@ class ShapedDriver(WrappedDriver):
     force changes it with the finger's direction, and the friction does not.
     """
 
+    calls_back = True
+
     def __init__(self, driver: Driver, shape: Callable[[Array], Any]) -> None:
         super().__init__(driver)
         self.shape = shape
@@ -92,6 +95,8 @@ class CarrierDriver(ShapedDriver):
     `envelope_rate` (Hz) that block and delay allow.  The carrier (`frequency`, Hz) starts at its crest, so that a
     device that blocks direct current keeps no charge.
     """
+
+    calls_back = False
 
     def __init__(
         self, driver: Driver, shape: Callable[[Array], Any], *, frequency: float, envelope_rate: float

@@ -42,8 +42,8 @@ static void decode(const uint8_t *bytes, size_t count)
 
 int main(void)
 {
-    static char line[70000], text[70000];
-    static uint8_t bytes[35000];
+    static char line[140000], text[140000];
+    static uint8_t bytes[70000];
     while (fgets(line, sizeof line, stdin) != NULL) {
         unsigned kind, sequence;
         if (sscanf(line, "e %x %x %s", &kind, &sequence, text) == 3) {

@@ -1,4 +1,4 @@
-/* A linear device behind a JACK client: x' = A x + B u, y = C x + D u, sample by sample, with white noise on its sensors.
+/* A device behind a JACK client: x' = A x + B u, y = C x + D u, sample by sample, with white noise on its sensors.
  *
  * jack_plate CLIENT FILE: FILE holds four whole numbers (states, inputs, outputs, samples to record), the rms of the
  * noise in full scales, then A, B, C and D row by row.  Ports are in_1.. and out_1..  Commands on standard input:
@@ -6,6 +6,7 @@
  *   free ON   1: go through periods as fast as all clients can, until 0
  *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
  *   stall MS  sleep once inside a period: the server reports an overrun
+ *   square N  square what comes in, as a carrier does, and add N (a load)
  *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
  *   count     print periods, overruns that JACK reported, and the time of the server in frames
  *   save FILE write what was recorded: float32, outputs without noise, then with it, a row a sample
@@ -24,7 +25,7 @@ enum { MOST = 64 };
 
 static int states, inputs, outputs;
 static long length, recorded;
-static double noise, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
+static double noise, load = -1.0, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
 static float *record;
 static jack_client_t *client;
 static jack_port_t *in_port[MOST], *out_port[MOST];
@@ -68,7 +69,7 @@ static int process(jack_nframes_t frames, void *unused) {
     for (int i = 0; i < outputs; i++) out[i] = jack_port_get_buffer(out_port[i], frames);
     for (jack_nframes_t n = 0; n < frames; n++) {
         double u[MOST], y[MOST];
-        for (int i = 0; i < inputs; i++) u[i] = in[i][n];
+        for (int i = 0; i < inputs; i++) u[i] = load < 0.0 ? in[i][n] : in[i][n] * in[i][n] + load;
         sample(u, y);
         if (y[0] > above) gain = next_gain;
         for (int i = 0; i < outputs; i++) out[i][n] = (float)(gain * (y[i] + noise * gauss()));
@@ -128,6 +129,7 @@ static void run(long count) {
 static void obey(char *line) {
     long number = 0;
     char name[4096];
+    sscanf(line, "square %lf", &load);
     sscanf(line, "gain %lf %lf", &next_gain, &above);
     if (sscanf(line, "run %ld", &number) == 1) run(number);
     if (sscanf(line, "free %ld", &number) == 1) jack_set_freewheel(client, (int)number);

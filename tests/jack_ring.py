@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import expm
 from synthetic import make_bands
 
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.audio import AudioDriver
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.plate import PlateParameters, structure
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -26,6 +28,7 @@ SOURCE = Path(__file__).with_name("jack_plate.c")
 CLIENT = "plate"
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
 AMPERES, METRES = 3.0, 1e-3  # of full scale, out and in
+PEAK, FRICTION = 10e-3, 4.0  # A, N: the same of a screen
 NOISE = 1e-6  # m rms, of a sensor
 ROUND_TRIP = 128  # samples: PortAudio and the plate each get what the other played in the period before
 FREQUENCY = np.array([40.0, 90, 140, 190, 240, 290, 340, 390])  # Hz
@@ -66,6 +69,21 @@ def plate(position: float = 0.01, load: float = 0.8) -> System:
     phi, gamma = built.zero_order_hold(RATE)
     outputs = np.pad(built.outputs[1:3], ((0, 0), (0, len(phi) - built.outputs.shape[1]))) / METRES
     return System(phi, gamma[:, :2] * AMPERES, outputs, np.zeros((2, 2)))
+
+
+def screen(speed: float, load: float) -> tuple[System, float]:
+    """Screen under a sliding finger (m/s, N), for the command `square` with the second number.
+
+    The sum of load and attraction makes the friction, behind the contact's memory and the tribometer's resonance, exact
+    under held drive.  Full scales are `PEAK` and `FRICTION`.
+    """
+    parameters = ElectroadhesionParameters()
+    attraction, pole = parameters.gain(load) * PEAK**2, speed / parameters.memory_length
+    w0 = 2 * np.pi * parameters.tribometer_frequency
+    a = np.array([[-pole, 0, 0], [0, 0, w0], [w0, -w0, -2 * parameters.tribometer_damping * w0]])
+    b = np.array([[pole * parameters.friction_coefficient * attraction / FRICTION], [0], [0]])
+    phi = expm(np.block([[a, b], [np.zeros((1, 4))]]) / RATE)
+    return System(phi[:3, :3], phi[:3, 3:], np.array([[0.0, 1, 0]]), np.zeros((1, 1))), load / attraction
 
 
 def cable(delay: float = 0.0, taps: int = 33, gain: float = 1.0) -> System:

@@ -89,9 +89,9 @@ class Calling(Bench):
     def call(self, entry):
         pointer, long = ctypes.c_void_p, ctypes.c_ulong
         callback = ctypes.CFUNCTYPE(ctypes.c_int, pointer, pointer, long, pointer, long, pointer)(entry.address)
-        given, made = np.zeros((self.block, 2), np.float32), np.zeros((self.block, 2), np.float32)
+        given, made = (np.zeros((self.block, each), np.float32) for each in (self.sensed_channels, self.drive_channels))
         while not self.stopping.is_set():
-            given[:] = self.plate.run(made.astype(float) / self.drive_scale).sensed / self.sensed_scale
+            given[:] = self.play(made.astype(float) / self.drive_scale).sensed / self.sensed_scale
             callback(given.ctypes.data, made.ctypes.data, self.block, None, 0, entry.user_data)
             self.last = made.copy()
             threading.Event().wait(1e-3)

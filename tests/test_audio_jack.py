@@ -342,6 +342,37 @@ def test_textures_change_under_the_callback(connected, tmp_path):
     assert abs(phasor(motion[end - round(RATE / 2) : end], 180.0, RATE)) == pytest.approx(2.5e-6, rel=0.02)
 
 
+def test_a_screen_is_played_by_the_compiled_callback(connected, tmp_path):
+    """Behind its square root, at the pace of a clock; within 3 %, the demand on friction, by its tribometer.
+
+    1 mN of noise over half a second of 48 kHz is 0.01 mN of some 16.  There is no attraction after the end.
+    """
+    speed, load = 0.08, 0.4
+    system, offset = jack_ring.screen(speed, load)
+    device = connected(system, length=round(60 * RATE), noise=1e-3 / jack_ring.FRICTION)
+    device.say(f"square {offset}")
+    scales = {"drive_per_full_scale": jack_ring.PEAK, "sensed_per_full_scale": jack_ring.FRICTION}
+    card = AudioDriver(CLIENT, (1,), (1,), delay=ROUND_TRIP, **scales)
+    tone = hr.Grating(frequency=100.0, velocity=10e-3)
+    with hr.Player("electroadhesion", card) as player, ThreadPoolExecutor(1) as pool:
+        player.finger(-0.08, speed, load)
+        player.play(tone)
+        device.say("pace 2")
+        player.record(tmp_path / "screen.au")
+        running = pool.submit(device.say, f"run {PERIODS}")
+        while not running.done():
+            player.finger(-0.08 + speed * player.time, speed, load)
+            player.sleep(0.01)
+        device.say("pace 0")
+        recording = player.end_recording()
+    wanted, found = (phasor(each[SETTLED], 100.0, RATE) for each in (recording.reference, recording.motion[:, 0]))
+    assert abs(found - wanted) < 0.03 * abs(wanted)
+    time.sleep(0.05)
+    friction = device.recorded(tmp_path / "record")[0][:, 0] * jack_ring.FRICTION
+    assert friction[-1] == pytest.approx(0.8 * load, rel=1e-3)  # of the load alone
+    assert friction.max() > friction[-1] + 2 * abs(wanted)  # the bias is headroom for twice the texture
+
+
 @pytest.mark.parametrize(
     ("gain", "named"),
     [(0.0, "one value repeats"), (-1.0, "are suddenly -"), (3.0, "are suddenly [23]"), (np.nan, "are no numbers")],

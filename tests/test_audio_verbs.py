@@ -6,6 +6,7 @@ depend on what else the machine does.
 
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -20,6 +21,7 @@ from waves import phasor
 import hapticrender as hr
 from hapticrender.cli import main
 from hapticrender.drivers.audio import AudioDriver
+from hapticrender.process_signals import Terminated
 from hapticrender.protocols import Flag
 
 pytestmark = pytest.mark.skipif(bool(jack_ring.missing()), reason=jack_ring.missing())
@@ -40,9 +42,8 @@ delay = {ROUND_TRIP}.0
 
 
 @pytest.fixture
-def plate(connected, monkeypatch):
-    """The plate without a finger as the second client, in freewheel from when a card is open until it closes."""
-    device = connected(jack_ring.plate(load=0.0), length=round(60 * RATE), noise=NOISE / METRES)
+def paced(connected, monkeypatch):
+    """Function that runs a system as the second client, in freewheel from when a card is open until it closes."""
     opened, closed = AudioDriver._open, AudioDriver.close
 
     def open_and_wait(driver):
@@ -58,7 +59,20 @@ def plate(connected, monkeypatch):
 
     monkeypatch.setattr(AudioDriver, "_open", open_and_wait)
     monkeypatch.setattr(AudioDriver, "close", close_in_time)
-    return device
+
+    def run(system, **options):
+        nonlocal device
+        device = connected(system, length=round(60 * RATE), **options)
+        return device
+
+    device = None
+    return run
+
+
+@pytest.fixture
+def plate(paced):
+    """The plate without a finger as the second client."""
+    return paced(jack_ring.plate(load=0.0), noise=NOISE / METRES)
 
 
 @pytest.fixture
@@ -142,6 +156,48 @@ def test_python_may_be_late(plate, tmp_path, at, periods):
     [begin] = np.flatnonzero((noisy[:, 0] == sensed[0, 0]) & (noisy[:, 1] == sensed[0, 1]))
     assert np.array_equal(noisy[begin : begin + len(sensed)], sensed) == (periods < 32)
     assert_accurate(recording)
+
+
+def hang(player):
+    while player._error is None:
+        time.sleep(0.01)
+    player.sleep(0.1)
+
+
+ENDS = {  # what ends an application, and how
+    "exception": (lambda player: 1 // 0, ZeroDivisionError),
+    "SIGTERM": (lambda player: signal.raise_signal(signal.SIGTERM), Terminated),
+    "SIGINT": (lambda player: signal.raise_signal(signal.SIGINT), KeyboardInterrupt),
+    "hangs": (hang, hr.WatchdogTimeout),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_what_ends_an_application_leaves_a_card_at_zero_drive_within_10_ms(paced, tmp_path, end):
+    """As the other side of the card records it, from the cause on: a block, and the two that the card holds.
+
+    Python, which a busy machine may keep for 60 ms, has 8 ms a period; the watchdog of 0.3 s needs none.
+    """
+    cause, error = ENDS[end]
+    device, patience = paced(jack_ring.straight()), 0.3 if end == "hangs" else np.inf
+    began = 0
+
+    def live(player):
+        nonlocal began
+        player.play(TONE)
+        player.record(tmp_path / "end.au")
+        player.sleep(0.3)
+        began = device.say("count").periods * BLOCK
+        cause(player)
+
+    with pytest.raises(error), hr.Player("vt-plate", AudioDriver(CLIENT), watchdog=patience) as player:
+        live(player)
+    began += round(patience * RATE) if end == "hangs" else 0
+    played, recording = device.recorded(tmp_path / "record")[0], hr.Recording.load(tmp_path / "end.au")
+    assert abs(played[began - 480 : began - BLOCK]).max() > 0.005
+    assert not played[began + 480 + 3 * BLOCK :].any()
+    assert recording.flags[-1] & Flag.STOPPED
+    assert not recording.drive[-1].any()
 
 
 LOSE = """

@@ -1,14 +1,17 @@
 """Boards and hosts that fail, and a line that damages, loses and repeats bytes; time is the board's own."""
 
+import struct
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 from board import RATE, Faults, SteppedBoard, driven, tones
 from synthetic import make_bands
 
 from hapticrender.drivers import protocol
-from hapticrender.drivers.protocol import Cause, Kind
+from hapticrender.drivers.protocol import Cause, Kind, Reason
 from hapticrender.drivers.serial import Line
-from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError
+from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, ProtocolError
 
 
 @pytest.fixture
@@ -149,6 +152,48 @@ def test_damage_that_the_crc_does_not_show_does_nothing(stepped):
     assert client.telemetry().commits == 1
     assert np.isnan(client.telemetry().position)
     assert [line for line in stepped.board.log()[len(before) :] if line[1] != "drives"] == []
+
+
+@pytest.mark.parametrize(
+    ("payload", "reason"),
+    [
+        (b"", Reason.LENGTH),
+        (bytes([protocol.VERSION]), Reason.LENGTH),
+        (struct.pack("<BIB", protocol.VERSION, 7, 0), Reason.LENGTH),
+        (struct.pack("<BI", protocol.VERSION, 0), Reason.VALUE),
+        (struct.pack("<BI", protocol.VERSION + 1, 7), Reason.VERSION),
+        (bytes([protocol.VERSION + 1]), Reason.VERSION),
+    ],
+)
+def test_a_greeting_that_does_not_hold_is_refused_with_its_reason(stepped, payload, reason):
+    """Of another version by that alone; the session that there is goes on."""
+    client = stepped.client().open()
+    version = pytest.raises(ProtocolError, match="the board refuses version")
+    with version if reason == Reason.VERSION else nullcontext():
+        assert client._line.request(Kind.HELLO, payload).refused == reason
+    client.set_bands(tones(47.0))
+
+
+@pytest.mark.parametrize(
+    ("finger", "there"),
+    [
+        ((0.15, 10.0, 0.0), True),
+        *((each, False) for each in ((1e30, 0.0, 0.4), (0.151, 0.0, 0.4), (0.0, 0.0, -0.1), (0.0, 0.0, np.nan))),
+        *(((0.0, speed, 0.4), False) for speed in (np.inf, -10.1, np.nan)),
+    ],
+)
+def test_a_finger_that_is_impossible_is_taken_for_lifted(stepped, finger, there):
+    """Keep-alives all the same: the board plays on."""
+    client = stepped.client().open()
+    client.set_bands(tones(47.0))
+    client.start(telemetry=0.001)
+    client.finger(0.01)
+    stepped.run(client, 0.02)
+    assert client.telemetry().position == pytest.approx(0.01)
+    client.finger(*finger)
+    stepped.run(client, 0.15)
+    assert np.isfinite(client.telemetry().position) == there
+    assert client.telemetry().state == protocol.State.PLAYING
 
 
 def test_a_commit_acts_only_on_what_it_says(stepped):

@@ -153,9 +153,7 @@ def test_textures_are_added_and_subtracted():
             act()
 
 
-@pytest.mark.parametrize(
-    ("device", "method"), [("hybrid", "inverse"), ("hybrid", "h2"), *(("vt-plate", each) for each in BY_BANDS)]
-)
+@pytest.mark.parametrize(("device", "method"), [("hybrid", "h2"), *(("vt-plate", each) for each in BY_BANDS)])
 def test_methods_that_play_bands_refuse_a_whole_waveform(device, method):
     texture = hr.Recorded(samples=ARRAY.samples, rate=2000.0, amplitude=1e-6, speed=0.1)
     scene = hr.Scene(texture=texture, finger=hr.Finger.sliding(speed=0.1), device=device, duration=0.1, method=method)

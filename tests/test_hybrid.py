@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from live_devices import Told, slide
 from tables import scene_on
+from waves import white
 
 import hapticrender as hr
 from hapticrender import loop
@@ -89,6 +90,38 @@ def test_a_recording_over_position_is_shared_out_by_the_fades():
     assert len(figures["bands"]) == 3
     for band in figures["bands"]:
         assert band["rms_error_skin"] < 0.07  # sensor noise is in it, and the analysis of the swelling waveform
+
+
+WHOLE = {
+    "noise": hr.Recorded(samples=white(25_000, 3e-6, rate=RATE), rate=RATE, gain=1.0),
+    "chirp": hr.Chirp(start=60.0, stop=300.0, duration=1.0, amplitude=5e-6),
+}
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_whole_waveform_is_the_plates_alone(name):
+    """Within 3 %, the demand on friction; its velocity weighs 400 Hz 20 times as much as 20."""
+    finger = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light", span=0.1)
+    recording = hr.render(hr.Scene(device="hybrid", texture=WHOLE[name], finger=finger, duration=2.5, settle=1.0))
+    assert recording.summary()["waveform"]["places"]["skin"]["waveform_error"] < 0.03
+    assert not recording.drive[:, 2].any()
+
+
+def test_whole_waveforms_play_live_and_change_into_each_other_but_not_into_gratings():
+    with hr.Player("hybrid", paced=False) as player:
+        player.play(WHOLE["noise"])
+        slide(player, 0.3, speed=0.08)
+        with pytest.raises(ValueError, match="changes to, or from, a whole waveform in a new Player only"):
+            player.play(tone(100.0))
+        player.play(WHOLE["chirp"])
+        slide(player, 0.8, start=0.004, speed=0.08)
+        [row] = player.state().bands
+    assert row.target == pytest.approx(5e-6 / np.sqrt(2) * 2 * np.pi * 230.0, rel=0.5)
+    assert row.error < 0.03
+    with hr.Player("hybrid", paced=False) as player:
+        player.play(tone(100.0))
+        with pytest.raises(ValueError, match="changes to, or from, a whole waveform"):
+            player.play(WHOLE["chirp"])
 
 
 def bench(sensed_channels=3, spoil=lambda sample, sensed: sensed):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Frame, Kind, Reader
+from hapticrender.protocols import Flag
 
 TABLE = Path(__file__).parent / "frames.txt"
 SESSION = 0x1A2B3C4D  # of the table
@@ -68,6 +69,17 @@ def test_the_table_has_every_command_with_its_check_value():
         assert payload[-4:] == struct.pack("<I", word)
         rows = {Kind.PROFILE: 4 * 2, Kind.SAMPLES: 3 * 2, Kind.DRIVE: 2 * 2 * 4}.get(kind, 0)
         assert len(payload) - 4 == struct.calcsize(protocol.LAYOUT[kind]) + rows
+
+
+def test_the_table_has_what_a_board_sends():
+    """Every kind; telemetry and stream by the fields that the table's comments name."""
+    frames = {frame.kind: frame.payload for frame, _ in FRAMES}
+    assert {kind for kind in Kind if kind > 0x80} <= set(frames)
+    telemetry, stream = protocol.telemetry(frames[Kind.TELEMETRY]), protocol.stream(frames[Kind.STREAM], 2, 2)
+    assert (telemetry.sample, telemetry.session, telemetry.state) == (5051, SESSION, protocol.State.PLAYING)
+    assert (telemetry.flags, telemetry.position) == (Flag.SENSOR_CLIPPED, pytest.approx(10e-3))
+    assert [each.target for each in telemetry.bands] == pytest.approx([10e-6])
+    assert (stream.first, stream.stride, len(stream.rows)) == (5051, 10, 2)
 
 
 def test_the_page_explains_a_frame_of_the_table():

@@ -18,8 +18,10 @@ from waves import Own
 import hapticrender as hr
 from hapticrender.bands import Bands
 from hapticrender.control.inverse import AdaptiveInverse
+from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import F8, kernel, pointer
 from hapticrender.mathx import smoothstep
+from hapticrender.plants.electroadhesion import SquareRoot
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
@@ -108,6 +110,31 @@ def test_the_finger_is_extrapolated_between_updates(friction, rng):
     np.testing.assert_allclose(played(entry, updates, sensed), expected, rtol=0, atol=tolerance)
     jumps = abs(np.diff(position))
     assert jumps[199] < 2e-5 < 1e-3 < jumps[499]  # 0.2 mm off are spread, 5 mm are another place
+
+
+@pytest.mark.parametrize("straight", [False, True])
+def test_the_drive_of_a_screen_is_the_peak_of_its_carrier(straight, rng):
+    """By the square root that is before a driver; a larger bias is reached within `FADE`; at rest it fades to zero."""
+    wanted = bands(wavenumber=500.0)
+    roots = [SquareRoot(bias=bias, floor=bias / 20, gain=2e4, straight=straight) for bias in (0.4, 0.9, 0.2)]
+    entry, twin = (RealtimeEntry(friction_controller(wanted)) for _ in range(2))
+    entry.set_root(roots[0])
+    sensed, n = 1e-7 * rng.standard_normal((1000, 2)), round(FADE * RATE)
+    for each in (entry, twin):
+        each.finger(-0.01, 0.05)
+    drive, _ = plain(twin, abs(sensed))
+    assert abs(drive).max() > 0.0
+    np.testing.assert_allclose(plain(entry, sensed[:500])[0], roots[0](drive[:500]), rtol=1e-12)
+    entry.set_root(roots[1])
+    rising = plain(entry, sensed[500 : 500 + n])[0]
+    assert (rising > roots[0](drive[500 : 500 + n])).all()
+    assert (rising[: n // 3] < roots[1](drive[500 : 500 + n // 3])).all()
+    entry.set_root(roots[2])
+    np.testing.assert_allclose(plain(entry, sensed[500 + n :])[0], roots[1](drive[500 + n :]), rtol=1e-12)
+    entry.silence()
+    fading, rest = np.split(plain(entry, sensed[:20])[0], [round(FADE_OUT * RATE)])
+    np.testing.assert_allclose(fading, roots[1](0.0) * (1 - np.arange(1, 11)[:, None] / 10), rtol=1e-12, atol=1e-15)
+    assert not rest.any()
 
 
 def wave(spatial, amplitude=1e-5):

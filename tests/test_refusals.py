@@ -259,7 +259,7 @@ SCENES = [
     (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
     (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
-    (lambda: opened("hybrid", replace(BY_CARRIERS["texture"], speed=None)), "a recording over time is not supported"),
+    (lambda: opened("hybrid", replace(BY_CARRIERS["texture"], speed=None)), "a recording over time on carriers is not"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),
 ]  # fmt: skip
 DRIVERS = [

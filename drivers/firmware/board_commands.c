@@ -4,7 +4,12 @@
 #include "board.h"
 #include "hardware.h"
 
-enum { CHECK = 4, SETPOINT_BYTES = 20, LINE_BYTES = 13, ROW_BYTES = 4 * LAW_CHANNELS };
+enum { CHECK = 4, HELLO_BYTES = 5, HEARTBEAT_BYTES = 8, FINGER_BYTES = 20 };
+enum { SETPOINT_BYTES = 20, LINE_BYTES = 13, ROW_BYTES = 4 * LAW_CHANNELS };
+
+#define MOST_POSITION 0.15f                       /* m from the middle, m/s, N: of any finger on a surface; */
+#define MOST_VELOCITY 10.0f                       /* beyond them it is taken for lifted */
+#define MOST_LOAD 20.0f
 
 typedef uint8_t (*handler)(board_t *board, const frame *from);
 
@@ -190,10 +195,14 @@ static void keep_alive(board_t *board, const frame *from)
         board->watchdog = board_samples_of(board, get_u16(from->payload + 6));
     }
     if (from->kind == KIND_FINGER) {
+        float position = get_f32(from->payload + 8), velocity = get_f32(from->payload + 12);
+        float load = get_f32(from->payload + 16);
+        int possible = fabsf(position) <= MOST_POSITION && fabsf(velocity) <= MOST_VELOCITY && load >= 0.0f &&
+                       load <= MOST_LOAD;         /* and no NaN */
         board->finger.written = get_u32(from->payload) + board->finger.offset;
-        board->finger.position = (real_t)get_f32(from->payload + 8);
-        board->finger.velocity = (real_t)get_f32(from->payload + 12);
-        board->finger.load = (real_t)get_f32(from->payload + 16);
+        board->finger.position = possible ? (real_t)position : (real_t)NAN;
+        board->finger.velocity = possible ? (real_t)velocity : REAL(0.0);
+        board->finger.load = possible ? (real_t)load : REAL(0.0);
     }
 }
 
@@ -235,13 +244,23 @@ static void begin_session(board_t *board, uint32_t nonce)
     }
 }
 
-static void hello(board_t *board, const frame *from)
+/* Return the reason why it is refused, or none; another version's may be of another length. */
+static uint8_t hello(board_t *board, const frame *from)
 {
     uint8_t payload[FRAME_PAYLOAD];
+    if (from->count > 0u && from->payload[0] != BOARD_VERSION) {
+        return REASON_VERSION;
+    }
+    if (from->count != HELLO_BYTES) {
+        return REASON_LENGTH;
+    }
     uint32_t nonce = get_u32(from->payload + 1);
+    if (nonce == 0u) {
+        return REASON_VALUE;
+    }
     int late = nonce == board->nonce && (int16_t)(uint16_t)(from->sequence - board->commanded) < 0;
     if (late) {
-        return;
+        return REASON_NONE;
     }
     if (nonce != board->nonce) {
         begin_session(board, nonce);
@@ -257,6 +276,7 @@ static void hello(board_t *board, const frame *from)
     at = put_u8(put_u16(put_u16(at, TEXTURE_RING), TEXTURE_POINTS), LAW_LOOKAHEAD);
     at = put_u8(at, LAW_FRICTION);
     reply(board, KIND_CAPABILITIES, from->sequence, payload, (size_t)(at - payload));
+    return REASON_NONE;
 }
 
 /* Commands with a reply, the bytes of their payload, and of the rows that follow it, 0: none. */
@@ -306,17 +326,19 @@ void board_command(board_t *board, frame *from)
         return;
     }
     from->count -= CHECK;
-    if (from->kind == KIND_HELLO && from->count == 5u) {
-        if (from->payload[0] == BOARD_VERSION && get_u32(from->payload + 1) != 0u) {
-            hello(board, from);
-        } else {
-            refuse(board, from, REASON_VERSION);
-        }
+    uint8_t reason = REASON_NONE;
+    if (from->kind == KIND_HELLO) {
+        reason = hello(board, from);
     } else if (board->session == 0u) {
-        refuse(board, from, REASON_CHECK);
-    } else if ((from->kind == KIND_HEARTBEAT && from->count == 8u) || (from->kind == KIND_FINGER && from->count == 20u)) {
-        keep_alive(board, from);
-    } else {
+        reason = REASON_CHECK;
+    } else if (from->kind != KIND_HEARTBEAT && from->kind != KIND_FINGER) {
         answer(board, from);
+    } else if (from->count != (from->kind == KIND_FINGER ? FINGER_BYTES : HEARTBEAT_BYTES)) {
+        reason = REASON_LENGTH;
+    } else {
+        keep_alive(board, from);
+    }
+    if (reason != REASON_NONE) {
+        refuse(board, from, reason);
     }
 }

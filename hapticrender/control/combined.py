@@ -13,7 +13,7 @@ import numpy as np
 from numba import carray
 
 from hapticrender.bands import Bands
-from hapticrender.control.controller import BankController, refuse_whole_waveform
+from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import CONTROLLER_T, MOST_CHANNELS, TILE_T, W
 from hapticrender.control.supervisor import Fault, SupervisedController, supervised
@@ -80,7 +80,7 @@ def combined_step(state, signals, start, count):
                 for s in range(p.sensors):
                     own[m, s] = sensed[first + m, sensor + s]
                 place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
-            if p.bands > 0:
+            if p.step != 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for k in range(MOST_CHANNELS):
                 p.heat[k] *= p.heat_decay
@@ -100,17 +100,21 @@ def combined_step(state, signals, start, count):
 class CombinedController(Addressed):
     """Controllers of one method for plate and friction device, with their shares of the targets, as one `Controller`.
 
-    A part is None where it has no target and stays without drive.  Without feedback both drive open loop.
+    A part is None where it has no target and stays without drive; a whole waveform is the plate's alone.  Without
+    feedback both drive open loop.  A ValueError where `bands` share nothing out, or the method plays no whole waveform.
     """
 
     def __init__(self, method: Method, model: CombinedModel, bands: CombinedBands, *, feedback: bool = True) -> None:
-        refuse_whole_waveform(bands, "a hybrid", "recordings over position")
+        if not isinstance(bands, CombinedBands):
+            raise ValueError("bands: must be CombinedBands, which share out what a device of two parts plays")
         self.method, self.bands, self.n_bands, self.step = getattr(method, "name", ""), bands, len(bands), combined_step
-        shares = (model.plate, bands.plate), (model.friction, bands.friction)
-        self.parts = tuple(_designed(method, each, own, feedback) for each, own in shares)
+        whole = bands.envelope is None and not len(bands)
+        shares = (model.plate, bands.plate, whole), (model.friction, bands.friction, False)
+        self.parts = tuple(_designed(method, *share, feedback) for share in shares)
         sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
         self.part_channels = channels = (model.plate.force_from_drive.shape[1], 1)
         self.channels, self.sensors = sum(channels), sum(sensors)
+        self.lookahead = int(getattr(self.parts[0], "lookahead", 0)) if whole else 0
         self.rate = next((part.rate for part in self.parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in self.parts)
         self.state = record_of(COMBINED, self, bands=self.n_bands)
@@ -175,8 +179,8 @@ class CombinedController(Addressed):
     run = BankController.run
 
 
-def _designed(method: Method, model: DeviceModel | None, bands: Bands, feedback: bool) -> Any:
+def _designed(method: Method, model: DeviceModel | None, bands: Bands, whole: bool, feedback: bool) -> Any:
     """Return a supervised controller of one part; None where it has no target."""
-    if model is None or not len(bands):
+    if model is None or not (len(bands) or whole):
         return None
     return supervised(method.design(model, bands, feedback=feedback), model, feedback=feedback)

@@ -174,12 +174,11 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
     return float(fixed.min(initial=math.inf if len(fixed) == len(bands) else model.lowest_frequency))
 
 
-def refuse_whole_waveform(bands: Bands, who: str = "this method", recordings: str = "recordings") -> None:
+def refuse_whole_waveform(bands: Bands) -> None:
     """Refuse a texture without carriers, in a method that works band by band."""
     if bands.envelope is None and not len(bands):
-        raise ValueError(
-            f"texture: {who} plays bands, no whole waveform: gratings, and {recordings} with carriers >= 1"
-        )
+        playable = "gratings, and recordings with carriers >= 1"
+        raise ValueError(f"texture: this method plays bands, no whole waveform: {playable}")
 
 
 def shared_settings(

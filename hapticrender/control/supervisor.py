@@ -124,8 +124,8 @@ CAUSES = {
         "wiring of all sensors and actuators",
     ),
     JUMP: (
-        "the friction jumped from one sample to the next, as no contact can; most likely the sensor is disconnected, "
-        "or its gain has changed",
+        "the friction or vibration jumped from one sample to the next, as none can; most likely the sensor is "
+        "disconnected, or its gain has changed",
         "cable, supply, range and gain of the sensor",
     ),
 }
