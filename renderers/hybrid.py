@@ -269,7 +269,7 @@ def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per
     """Models of both; what is judged is a velocity, which no coordinate and no sensor of the plate shows."""
     of_both: dict[str, Any] = {
         "places": PLACES,
-        "shown": np.zeros((len(PLACES), SENSORS)),
+        "shown": np.zeros((len(PLACES), SENSORS + 1)),
         "lever_per_metre": 0.0,
         "drive_limit": np.inf,
         "sensed_limit": np.inf,
