@@ -33,13 +33,13 @@ FORMS = "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or package.module:
 
 def registered(group: str, name: str) -> Any:
     """Load what the entry-point `group` (renderers, drivers) registers under `name`."""
-    found = _points(group)
+    found, what = _points(group), "device" if group == "renderers" else "driver"
     if name not in found:
-        raise ValueError(f"{group[:-1]} {name!r} is not installed: must be one of {', '.join(found) or 'none'}")
+        raise ValueError(f"{what} {name!r} is not installed: must be one of {', '.join(found) or 'none'}")
     try:
         return found[name].load()
     except Exception as error:
-        reason = f"{group[:-1]} {name!r} cannot be loaded: {type(error).__name__}: {error}{_cure(error)}"
+        reason = f"{what} {name!r} cannot be loaded: {type(error).__name__}: {error}{_cure(error)}"
         raise HapticError(reason) from error
 
 

@@ -40,8 +40,9 @@ class PlayerState:
         lines = []
         for band in self.bands:
             label = f"{band.frequency:7.1f} Hz" if band.frequency > 0.0 else "  rms of all"
+            kind = "error" if band.frequency > 0.0 else "difference"
             achieved = "not sensed" if math.isnan(band.achieved) else f"achieved {band.achieved:9.3g} {self.unit}"
             error = "  -" if math.isnan(band.error) else f"{100 * band.error:6.2f} %"
-            lines.append(f"{label}  target {band.target:9.3g} {self.unit}  {achieved}  error {error}")
+            lines.append(f"{label}  target {band.target:9.3g} {self.unit}  {achieved}  {kind} {error}")
         load = "" if math.isnan(self.load) else f", load {100 * self.load:.0f} %"
         return "\n".join([*lines, f"{self.time:.1f} s, {self.flags.name or 'no flags'}, {self.lost} lost{load}"])
