@@ -50,11 +50,20 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
+def _whole(least: int, most: int) -> Any:
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) <= 18 and least <= int(text) <= most):
+            raise argparse.ArgumentTypeError(f"{text!r}: must be a whole number from {least} to {most}")
+        return int(text)
+
+    return read
+
+
 _METHODS = f"one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
 _METHOD = _option("--method", "NAME", f"control method: {_METHODS}")
 _KINDS = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
 _DRIVER = _option("--driver", "NAME[:ARG]", _KINDS, default="simulated")
-_SEED = _option("--seed", "N", "seed of the noise (default: the scene's)", int)
+_SEED = _option("--seed", "N", "seed of the noise (default: the scene's)", _whole(0, 10**18 - 1))
 _SCENE = _option("scene", "SCENE", "a TOML file, or the name of a built-in scene")
 _RECORDING = _option("path", "PATH", "a recording, or the folder of a rendered scene", _path)
 _FOLDER, _DEMO = "folder to write into; made if it is not there", Path("out/demo")
@@ -86,7 +95,7 @@ _VERBS: dict[str, list[Any]] = {  # line of help and options of each; `hapticren
         _option("--json", "FILE", "write all figures as JSON; its folder is made", _path),
         _option("--junit", "FILE", "write the JUnit XML that CI systems read; its folder is made", _path),
         _option("--out -o", "DIR", "folder for the files of each scene that does not pass", _path),
-        _option("--jobs -j", "N", "processes (default: 1)", int, default=1),
+        _option("--jobs -j", "N", "processes (default: 1)", _whole(1, 999), default=1),
         _option("--strict", "", "exit 1 also where a scene is not judged"),
         *(_METHOD, _DRIVER, _SEED),
     ],
@@ -95,7 +104,7 @@ _VERBS: dict[str, list[Any]] = {  # line of help and options of each; `hapticren
         "measure the finger in a recording of a plate: load, position, contact, impedance",
         _RECORDING,
         _option("--profile", "FILE", "profile (TOML) of the plate (default: that of the recording's scene)", _path),
-        _option("--block", "N", "samples of the driver's block (default: as recorded, or 1)", int),
+        _option("--block", "N", "samples of the driver's block (default: as recorded, or 1)", _whole(1, 99999)),
         _option("--free-start", "", _FREE_START),
         *(_OUT, _FORCE),
     ],
@@ -112,14 +121,14 @@ _VERBS: dict[str, list[Any]] = {  # line of help and options of each; `hapticren
     "latency": [
         "measure the delay of a loop by a cable from a driver's first output to its first input",
         _option("--driver", "NAME[:ARG]", "driver of the device, such as audio:0", required=True),
-        _option("--runs", "N", "runs, which must agree (default: 5)", int, default=5),
+        _option("--runs", "N", "runs, which must agree (default: 5)", _whole(1, 999), default=5),
         _option("--amplitude", "A", f"of the noise, {_FULL_SCALE} (default: 0.1)", float, default=0.1),
         _option("--out -o", "FILE", "profile (TOML) whose [calibration] gets the delay; made if not there", _path),
     ],
     "export": [
         "write a scene's controller as C sources for a microcontroller",
         _SCENE,
-        _option("--bands", "N", "most on the board (default: 8, or the scene's number)", int, default=0),
+        _option("--bands", "N", "most on the board (default: 8, or the scene's number)", _whole(1, 64), default=0),
         *(_OUT, _FORCE),
     ],
     "scenes": [

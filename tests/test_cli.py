@@ -262,8 +262,11 @@ def test_scenes_are_listed_and_printed(run):
     assert (status, errors) == (0, [])
     assert [line.split()[0] for line in out.splitlines()] == list(builtin_scenes())
     assert all(len(line.split()) > 3 for line in out.splitlines())
-    _, out, _ = run("scenes", "sliding")
-    assert Scene.from_toml_text(out, where="sliding") == builtin_scenes()["sliding"]
+    assert "recorded 13.97 µm; finger" in out
+    for name in "sliding", "recorded-texture":
+        _, out, _ = run("scenes", name)
+        assert Scene.from_toml_text(out, where=name) == builtin_scenes()[name]
+        assert max(map(len, out.splitlines())) <= 110
 
 
 def test_devices_are_listed_with_what_each_needs(run):
@@ -325,6 +328,16 @@ BAD_ARGUMENTS = [
     (["latency", "--driver", "audio:no such card"], "audio:"),
     (["export", "ultrasonic-swiping", "--out", "{out}"], "a board plays vt-plate and electroadhesion only"),
     (["validate", "{tiny}", "--driver", PLATE, "--jobs", "2"], f"must be 1 process where driver = '{PLATE}'"),
+    *(
+        ([*verb.split(), option, value], f"argument {option}{short}: '{value}': must be a whole number from {bound}")
+        for verb, option, short, value, bound in (
+            ("identify", "--seed", "", "-1", "0 to 999999999999999999"),
+            ("validate --suite accuracy", "--seed", "", "-1", "0 to 999999999999999999"),
+            ("validate {tiny}", "--jobs", "/-j", "100000000", "1 to 999"),
+            ("export grating-47 --out {out}", "--bands", "", "0", "1 to 64"),
+            ("latency --driver tea", "--runs", "", "2.5", "1 to 999"),
+        )
+    ),
     (["validate", "--suite", "accuracy", "--jobs", "2"], "--suite runs in one process, and writes --json only"),
     (
         ["validate", "--suite", "accuracy", "tea"],

@@ -1,5 +1,6 @@
 """Loop shaping: the controllers, their margins to the last printed digit, and the loop slowed down for its delay."""
 
+import re
 from math import radians
 
 import numpy as np
@@ -16,7 +17,7 @@ from examples.grigorii2021.shaping import (
 )
 from hapticrender.bands import Bands
 from hapticrender.control.demodulator import StarSTDFT
-from hapticrender.control.loopshape import MOST_DELAY, envelope_loop, loop_section
+from hapticrender.control.loopshape import MOST_DELAY, _widest, envelope_loop, loop_section
 from hapticrender.control.margins import LeastMargins
 from hapticrender.control.methods import MOST_INTEGRAL
 from hapticrender.errors import DesignError
@@ -142,8 +143,16 @@ def test_a_loop_is_a_quarter_of_the_carrier_or_as_wide_as_its_delay_allows():
     for each, kept in ((width, True), (width / 0.9, False)):
         margins = loop_margins(reduced_controller(each, 2 * each) * butterworth(2 * each), delay)
         assert (LEAST.complaint(margins) == "") is kept
+
+
+@pytest.mark.parametrize("lowest", [20.0, 43.0, 111.0])
+def test_the_delay_that_a_refusal_states_is_accepted_and_a_hundredth_more_is_not(lowest):
+    """It is rounded down, to three digits, from 0.995 of the bound: at least 0.99 of it."""
     with pytest.raises(
-        DesignError,
-        match=r"delay of 5 s leaves too small a margin: must be <= 0.1\d+ s, even with a loop of 0.2\d\d Hz: lower it",
-    ):
-        loop_of(25_000)
+        DesignError, match=r"leaves too small a margin: must be <= \S+ s, even with a loop of"
+    ) as refused:
+        _widest(lowest, 5.0)
+    stated = float(re.search(r"<= (\S+) s", str(refused.value))[1])
+    assert _widest(lowest, stated)[0] >= 0.05 * lowest / 4
+    with pytest.raises(DesignError):
+        _widest(lowest, 1.011 * stated)

@@ -216,6 +216,13 @@ def test_what_is_saved_loads_the_same(recording, tmp_path, suffix):
     assert loaded.summary() == recording.summary()
 
 
+def test_a_sound_file_of_a_run_is_not_loaded_but_its_journal(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"'\.wav' cannot be read \(load the \.au of the run instead\), known are \.au"
+    ):
+        Recording.load(tmp_path / "run.wav")
+
+
 @pytest.mark.parametrize("verb", ["save", "load"])
 def test_an_unknown_suffix_lists_the_known_ones_and_a_missing_folder_is_named(recording, tmp_path, verb):
     with pytest.raises(ValueError, match=r"'\.mp3' cannot be .*, known are \.au,.* \.npz"):
@@ -312,6 +319,17 @@ CHANGES = [
     ({"name": "a\x1b[2J"}, "name = 'a\\x1b[2J': must be a text of printable characters"),
     ({"tolerance": None}, "tolerance is missing"),
     ({"bands": {"frequency": [1], "wavenumber": [0, 1], "phase": [0]}}, "wavenumber has shape (2,)"),
+    *(
+        ({"bands": {"frequency": [100.0], "wavenumber": [0], "phase": [0]} | bad}, message)
+        for bad, message in (
+            ({"frequency": ["100"]}, "bands.frequency = ['100']: must be a list of"),
+            ({"frequency": [True]}, "bands.frequency = [True]: must be a list of"),
+            ({"frequency": [1e300]}, "bands.frequency[0] = 1e+300: must be a finite number >= -1e+12 and <= 1e+12"),
+            ({"phase": None}, "bands.phase is missing: must be a list of"),
+            ({"envelope": [1.0, 0.0]}, "bands.envelope = [1.0, 0.0]: must be pairs of real and imaginary part"),
+            ({"envelope": [[1.0]]}, "bands.envelope = [[1.0]]: must be pairs of real and imaginary part"),
+        )
+    ),
     ({"sensed_noise": [0.0, 1.0]}, "sensed_noise = (0.0, 1.0): must be one number, or one a place"),
     ({"version": 99}, "version = 99: must be 2"),
     ({"format": "theirs"}, "(format = "),

@@ -25,7 +25,9 @@ from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.export import board_design
 from hapticrender.loop import prepare
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen
 from hapticrender.plants.friction_laws import FitLaw
+from hapticrender.plants.hybrid import HybridPlant
 from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
@@ -91,9 +93,9 @@ def entry():
     return RealtimeEntry(in_blocks(1))
 
 
-def played_late(method):
-    late = PlateParameters(delay=25_000).device_model(5000.0, 25_000)
-    return method_named(method).design(late, make_bands(47.0, 1e-5))
+def played_late(method, delay=25_000, bands=None):
+    late = PlateParameters(delay=delay).device_model(5000.0, delay)
+    return method.design(late, make_bands(47.0, 1e-5) if bands is None else bands)
 
 
 def fitted(order=None, **changes):
@@ -139,6 +141,13 @@ SKIN = {"order": 4, "mass": 1e-4, "damping": 1.0, "stiffness": 1e3, "phalanx_dam
 MASSLESS = hr.Finger.still(normal_load=0.5, mechanics=SKIN)
 UNIT = {"order": 2, "mass": 1e-3, "phalanx_mass": 1e-3}
 SCREEN = friction_tone(100.0)
+
+
+def hybrid(velocity_per_force=0.64, **parameters):
+    screen = ElectroadhesionScreen(ElectroadhesionParameters(), SLIDE)
+    return HybridPlant(Plate(PlateParameters(**parameters), SLIDE), screen, velocity_per_force)
+
+
 BY_CARRIERS = {"texture": hr.builtin_scenes(carriers=6)["recorded-texture"].texture, "finger": SLIDE}
 STRONG, FAST = friction_tone(100.0, force=2.0), hr.Grating(frequency=100.0, velocity=0.2)
 FAR_UP = hr.Grating(velocity=1.5, frequency=250.0)
@@ -294,7 +303,11 @@ DESIGNS = [
     (lambda: method_named("papper"), r"method = 'papper': must be one of paper, paper-common"),
     (lambda: Resonant(gain=17.0).design(MODEL, make_bands(47.0, 1e-5)), r"gain=17 1/s must be below 16\.1 1/s"),
     *(
-        (lambda method=method: played_late(method), "margin|unstable|sensitivity")
+        (lambda gain=gain: Resonant(gain=gain), "gain = .*: must be a finite number > 0 1/s")
+        for gain in (-1.0, 0, np.nan)
+    ),
+    *(
+        (lambda method=method: played_late(method_named(method)), "margin|unstable|sensitivity")
         for method in ("boxcar", "static", "stiffness", "resonant")
     ),
     (lambda: in_blocks().run(*map(np.zeros, ((30, 2), 30, 30))), "30 samples: must be a multiple of the block of 25"),
@@ -319,6 +332,25 @@ EACH = [pytest.param(*row, id=f"{kind} {n}") for kind, rows in KINDS.items() for
 def test_what_cannot_be_is_refused(make, message):
     with pytest.raises((ValueError, TypeError, hr.DesignError), match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    "bad", [{"rate": 5e3}, {"coils": 1}, {"velocity_per_force": 0.0}, {"velocity_per_force": np.nan}]
+)
+def test_a_hybrid_is_of_a_plate_with_two_coils_at_the_rate_of_the_screen(bad):
+    assert hybrid(rate=10e3).rate == 10e3
+    with pytest.raises(
+        ValueError, match=r"plate.rate, its coils, velocity_per_force = .*: must be 10000 Hz, 2 and > 0 m"
+    ):
+        hybrid(**{"rate": 10e3} | bad)
+
+
+def test_a_gain_is_refused_as_it_was_given_and_the_one_stated_is_accepted():
+    """0.613 / 0.2 s for each of two bands."""
+    bands = make_bands([47.0, 111.0], 1e-6)
+    with pytest.raises(hr.DesignError, match=r"gain=10 1/s must be <= 6\.13 1/s of 2 bands behind a delay of 0\.2 s"):
+        played_late(Resonant(gain=10.0), 1000, bands)
+    assert played_late(Resonant(gain=6.13), 1000, bands)
 
 
 TEXTURE = hr.Grating(velocity=5e-3, frequency=100.0)

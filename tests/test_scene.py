@@ -264,3 +264,13 @@ def test_what_cannot_be_felt_is_played_unless_it_is_left_out():
     less = hr.render(replace(scene, keep_unfelt=False)).summary()
     missing = 3.0 / np.hypot(3.0, 2.0)
     assert (less["verdict"], less["worst"]["value"]) == ("failed", pytest.approx(missing, rel=0.02))
+
+
+def test_long_lists_take_several_lines_and_read_the_same_inside_other_tables():
+    long = np.linspace(-1.0, 1.0, 400).tolist()
+    part = {"kind": "recorded", "samples": long, "rate": 1000.0, "gain": 1e-6}
+    table = {"texture": {"samples": long, "kind": "sum", "parts": [[part, 1.0], [{"file": "a, b " * 30}, 2.0]]}}
+    text = toml_text.dumps(table)
+    assert toml_text.loads(text) == table
+    assert text.index("kind") < text.index("samples")
+    assert "\n" not in toml_text.dumps({"short": long[:4]}).strip()

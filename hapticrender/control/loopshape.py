@@ -78,6 +78,7 @@ def _widest(lowest: float, delay: float) -> Bandwidths:
     while width * delay > MOST_DELAY:
         width *= NARROWER
         if width < SLOWEST * lowest / 4:
-            bound = f"must be <= {MOST_DELAY / width:.3g} s, even with a loop of {width:.3g} Hz"
+            last = width / NARROWER
+            bound = f"must be <= {0.995 * MOST_DELAY / last:.3g} s, even with a loop of {last:.3g} Hz"  # rounded down
             raise DesignError(f"delay of {delay:.3g} s leaves too small a margin: {bound}: lower it")
     return width, 2 * width

@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from hapticrender.bands import Bands
+from hapticrender.checks import Validated, parameter
 from hapticrender.control.controller import (
     BankController,
     device_settings,
@@ -128,7 +129,7 @@ class Inverse:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Resonant:
+class Resonant(Validated):
     """Adaptive feed-forward cancellation (proportional-resonant control): one integrator a band and coordinate.
 
     Notes
@@ -138,7 +139,9 @@ class Resonant:
     the mode's own m w1/Q, that is, sum ki < w1/2Q, its decay rate.
     """
 
-    gain: float = 15.0  # 1/s, sum of ki over the bands, > 0, below the decay rate of the least damped mode
+    gain: float = parameter(
+        15.0, "1/s", above=0.0
+    )  # sum of ki over the bands, below the decay rate of the least damped mode
     checked: bool = True  # refuse a gain or a delay beyond its bound; naive without
     name: ClassVar[str] = "resonant"
 
@@ -153,8 +156,9 @@ class Resonant:
                     f"which it takes away: lower gain"
                 )
             if each * late > MOST_INTEGRAL:
-                bound = f"must be <= {MOST_INTEGRAL / late:.3g} 1/s a band behind a delay of {late:.3g} s"
-                raise DesignError(f"too small a margin: gain={each:g} 1/s {bound}: lower it, or the delay")
+                most = len(bands) * MOST_INTEGRAL / late
+                bound = f"must be <= {most:.3g} 1/s of {len(bands)} bands behind a delay of {late:.3g} s"
+                raise DesignError(f"too small a margin: gain={self.gain:g} 1/s {bound}: lower it, or the delay")
         settings = complex_settings(model, bands, model.lowest_frequency / 4, False, feedback)
         half = 0.5 * each * period
         settings |= {"low_pass": ALL_PASS, "loop": (half, half, 0.0, -1.0, 0.0)}

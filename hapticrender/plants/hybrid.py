@@ -12,6 +12,7 @@ import numba
 import numpy as np
 from numba import carray
 
+from hapticrender.checks import require
 from hapticrender.jit import F8, I8, SIGNALS, SIGNALS_T, call, pointer, record_of, step
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.plate import Plate
@@ -75,8 +76,8 @@ class HybridPlant(CompiledPlant):
     Drive: a current for each coil (A), then the screen's; sensed: both ends of the plate (m), then what the screen
     senses (N); `motion`: the skin's velocity (m/s), then what plate and screen add to it.  The screen is any compiled
     plant of one drive channel and one sensor, whose motion starts with friction (N); `velocity_per_force` (m/(N s)) is
-    the skin velocity that matches a newton of friction.  The plate has two coils; both parts have one rate, a delay of
-    a sample and one finger, as is checked where a scene is read.
+    the skin velocity that matches a newton of friction, > 0.  The plate has two coils, and both parts have one rate;
+    that they have one finger and a delay of a sample is checked where a scene is read.
     """
 
     step = hybrid_step
@@ -84,6 +85,10 @@ class HybridPlant(CompiledPlant):
     motion_channels = 3
 
     def __init__(self, plate: Plate, screen: CompiledPlant, velocity_per_force: float) -> None:
+        stated = plate.rate, plate.drive_channels, velocity_per_force
+        good = stated[:2] == (screen.rate, COILS) and 0.0 < velocity_per_force < np.inf
+        names, bound = "plate.rate, its coils, velocity_per_force", f"{screen.rate:g} Hz, {COILS} and > 0 m/(N s)"
+        require(good, names, stated, bound)
         super().__init__(screen.finger, screen.rate)
         self.plate, self.screen = plate, screen
         self.noise_channels = plate.noise_channels + screen.noise_channels

@@ -30,7 +30,7 @@ def read(path: str | os.PathLike[str]) -> tuple[Header, Any]:
     recording of this library, a `MissingExtra` where reading it takes an optional part that is not installed.
     """
     path = Path(path)
-    reader = _by_suffix(path, READERS, "read")
+    reader = _by_suffix(path, READERS, "read (load the .au of the run instead)")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise ValueError(f"{path}: must be a regular file")
     with path.open("rb"), naming_damage(path):  # a missing file is the same OSError for every format

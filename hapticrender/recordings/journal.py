@@ -43,6 +43,11 @@ def _places(key: str, value: Any) -> tuple[str, ...]:
     return names
 
 
+def _row(key: str, value: Any) -> Array:
+    """Return a list of numbers, which may be empty, as an array."""
+    return np.array(() if value == [] else numbers(key, value, least=-1e12, most=1e12), float)
+
+
 def _noise(key: str, value: Any) -> tuple[float, ...]:
     """Return a noise for each place; one number is that of all."""
     if isinstance(value, list | tuple | np.ndarray):
@@ -55,10 +60,12 @@ def _bands(key: str, value: Any) -> Bands:
     if isinstance(value, Bands):
         return value
     require(isinstance(value, dict), key, value, "an object")
-    fields: dict[str, Any] = {name: np.array(value.get(name), float) for name in _COLUMNS}  # which `Bands` checks
+    fields: dict[str, Any] = {name: _row(f"{key}.{name}", value.get(name)) for name in _COLUMNS}
     pairs, unfelt = value.get("envelope"), value.get("unfelt", [])
     if pairs is not None:
-        fields["envelope"] = np.array(pairs, float).reshape(-1, 2).view(complex)[:, 0]
+        good = isinstance(pairs, list) and all(isinstance(pair, list) and len(pair) == 2 for pair in pairs)
+        require(good, f"{key}.envelope", pairs, "pairs of real and imaginary part")
+        fields["envelope"] = _row(f"{key}.envelope", [part for pair in pairs for part in pair]).view(complex)
     require(isinstance(unfelt, list), f"{key}.unfelt", unfelt, "a list")
     marks: dict[str, Any] = {name: flag(f"{key}.{name}", value.get(name, False)) for name in _MARKS}
     return Bands(**fields, **marks, unfelt=tuple(text(f"{key}.unfelt", each, 1000) for each in unfelt))

@@ -40,13 +40,13 @@ def _scene(name: str, texture: Any, finger: Finger, duration: float, **fields: A
     return Scene(name=name, texture=texture, finger=finger, duration=duration, **fields)
 
 
-def _recording(gain: float, carriers: int | None) -> Recorded:
-    """64 mm of a surface, recorded at 80 mm/s, of partials that swell and together stay below `gain` (m)."""
+def _recording(amplitude: float, carriers: int | None) -> Recorded:
+    """64 mm of a surface, recorded at 80 mm/s, of partials that swell, with a peak of `amplitude` (m)."""
     phase, start = np.random.default_rng(0).uniform(0.0, 2 * np.pi, (2, len(PARTIALS)))
     turn = 2 * np.pi * np.arange(800)[:, None] / 1000
     values = ((1 + 0.5 * np.cos(0.5 * turn + start)) * np.cos(PARTIALS * turn + phase)).sum(axis=1)
     samples = (values / (1.5 * len(PARTIALS))).round(3).tolist()
-    return Recorded(samples=tuple(samples), rate=1000.0, speed=0.08, gain=gain, carriers=carriers)
+    return Recorded(samples=tuple(samples), rate=1000.0, speed=0.08, amplitude=amplitude, carriers=carriers)
 
 
 def _on_the_plate(carriers: int | None) -> Iterator[Scene]:
@@ -56,7 +56,7 @@ def _on_the_plate(carriers: int | None) -> Iterator[Scene]:
         yield _scene(f"grating-{frequency:g}", texture, Finger.absent(), 5.0, tolerance=0.02)
     ridges = Grating(amplitude=10e-6, wavelength=1e-3)  # 80 Hz at 80 mm/s
     yield _scene("spatial-grating", ridges, LIFTING, 6.0)
-    yield _scene("recorded-texture", _recording(20e-6, carriers), SWEEPING, 5.0)
+    yield _scene("recorded-texture", _recording(13.97e-6, carriers), SWEEPING, 5.0)
     wandering = Finger.sliding(speed=0.1, normal_load=0.8, span=0.05, mechanics="heavy")
     yield _scene("sliding", Grating(amplitude=50e-6, frequency=143.0), wandering, 5.0)  # near the rocking mode
     press = Finger.still(normal_load=0.5, touches=[(0.5, 5.0)], mechanics="auto")  # its sag is many times the target
@@ -69,7 +69,7 @@ def _by_friction(carriers: int | None) -> Iterator[Scene]:
     """Ridges and a recording on a screen, swipes on an ultrasonic plate, and one that warms up."""
     ridges = Grating(velocity=8e-3, wavelength=1e-3, speed=0.08)
     yield _scene("screen-spatial", ridges, LIFTING, 6.0, device="electroadhesion")
-    yield _scene("screen-recorded", _recording(40e-6, carriers), SWEEPING, 5.0, device="electroadhesion")
+    yield _scene("screen-recorded", _recording(27.94e-6, carriers), SWEEPING, 5.0, device="electroadhesion")
     swipes = Finger.swiping(frequency=1.0, speed=0.15, normal_load=0.5, mechanics="light")
     slower = Grating(velocity=8e-3, wavelength=1e-3, speed=0.1)
     yield _scene("ultrasonic-swiping", slower, swipes, 4.0, device="ultrasonic")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 LARGEST_FILE = 1 << 26  # bytes of TOML
+LONGEST_LINE = 100  # characters of a list, about
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -41,6 +42,8 @@ def loads(text: str) -> dict[str, Any]:
 def dumps(table: Mapping[str, Any]) -> str:
     """TOML text of nested tables, lists, strings, dates, numbers and booleans; floats survive to the last bit.
 
+    A long list takes several lines, and is the last of its table.
+
     >>> print(dumps({"name": "a", "texture": {"amplitude": 1e-05}}))
     name = "a"
     <BLANKLINE>
@@ -51,7 +54,8 @@ def dumps(table: Mapping[str, Any]) -> str:
     lines = [f"{_key(key)} = {_value(value)}" for key, value in table.items() if not isinstance(value, Mapping)]
     for key, value in table.items():
         if isinstance(value, Mapping):
-            lines += ["", f"[{_key(key)}]", *(f"{_key(inner)} = {_value(entry)}" for inner, entry in value.items())]
+            entries = (f"{_key(inner)} = {_value(entry)}" for inner, entry in value.items())
+            lines += ["", f"[{_key(key)}]", *sorted(entries, key=lambda entry: "\n" in entry)]
     return "\n".join(lines) + "\n"
 
 
@@ -71,7 +75,13 @@ def _value(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        entries = [*map(_value, value)]
+        line = ", ".join(entries)
+        if len(line) <= LONGEST_LINE:
+            return f"[{line}]"
+        count = max(1, LONGEST_LINE // (max(map(len, entries)) + 2))
+        rows = (", ".join(entries[i : i + count]) for i in range(0, len(entries), count))
+        return "[\n  " + ",\n  ".join(rows) + ",\n]"
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)} = {_value(entry)}" for key, entry in value.items()) + "}"
     raise TypeError(f"a {type(value).__name__} has no place in TOML")
