@@ -9,7 +9,7 @@ from held import amplitude_error, envelopes, fixed, hold, play
 from waves import phasor
 
 import hapticrender as hr
-from examples.grigorii2021.shaping import butterworth, loop_margins, reduced_controller
+from examples.grigorii2021.shaping import butterworth, loop_margins, second_order_controller
 from hapticrender.control.controller import setpoint_rows
 from hapticrender.control.methods import METHODS, Polar
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -104,7 +104,7 @@ def test_a_static_inverse_is_unstable_near_the_modes_under_a_finger(mechanics, u
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_phase_error_of_the_plant_up_to_the_phase_margin_is_held(sign):
     """61.5 deg away from resonance; 38 deg for the static inverse at the mode."""
-    margins = loop_margins(reduced_controller(5.0, 10.0) * butterworth(10.0))
+    margins = loop_margins(second_order_controller(5.0, 10.0) * butterworth(10.0))
     assert np.degrees(margins.phase) == pytest.approx(61.5, abs=0.05)
     for method, frequency, degrees, holds in (
         ("static", 111.0, 55, True),

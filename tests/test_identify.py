@@ -220,6 +220,9 @@ def test_the_same_plate_gives_no_difference_and_another_one_its_numbers(one):
     near = dataclasses.replace(PAPER, stiffness_1=PAPER.stiffness_1 / 1.005)
     assert [each.split()[0] for each in one.differences(near)] == ["stiffness_1"]
     assert [each.split()[0] for each in one.differences(other)] == ["mass", "stiffness_1"]
+    mass, interval = one.estimates["mass"]
+    for times, count in ((1.9, 0), (2.1, 1)):  # its half-width of 95 %
+        assert len(one.differences(dataclasses.replace(PAPER, mass=mass + times * interval))) == count
     text = "; ".join(one.differences(other))
     assert re.match(r"mass -[45]\.\d\d \+- 0\.0\d %; stiffness_1 \+[45]\.\d\d", text)
 

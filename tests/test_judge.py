@@ -405,6 +405,16 @@ def test_a_place_that_is_to_move_by_less_than_a_tenth_of_another_counts_as_a_ten
     assert (summary["bands"][0]["error_end_1"] is None) == (share < 0.05)
 
 
+def test_above_500_hz_a_quiet_place_may_not_move_by_more_than_its_own_share():
+    """Its share is a twentieth, which counts as a tenth: 1.5 % of the texture on top of 5 read 15 % of a tenth."""
+    high = 100 * hr.detection_threshold(630.0, "classic")  # so that the texture is above what counts at least
+    bands, profile = make_bands([50.0, 630.0], [20 * UM, high]), (1.0, 0.05, 1.0)
+    extra = np.outer(0.015 * high * np.cos(2 * np.pi * 630.0 * times(4.0)), [0.0, 1.0, 0.0])
+    motion = np.reshape(profile, (3, 1)) * bands.envelope
+    figures = summary_of(bands, make_signals(bands, motion, extra=extra), {"profile": profile})["waveform"]["places"]
+    assert figures["end_1"]["third_octaves"]["630 Hz"] == pytest.approx(0.15, rel=1e-6)
+
+
 def test_a_lost_sample_of_friction_is_lost_alone(rng):
     """The mean friction of a touch is taken off, of what is known of it."""
     noise, bands = white(20, 400, rng, rms=0.01), make_bands(100.0, 0.0)

@@ -13,7 +13,7 @@ from examples.grigorii2021.shaping import (
     butterworth,
     exact_controller,
     loop_margins,
-    reduced_controller,
+    second_order_controller,
 )
 from hapticrender.bands import Bands
 from hapticrender.control.demodulator import StarSTDFT
@@ -28,7 +28,7 @@ L = butterworth(10.0)
 LEAST = LeastMargins(modulus=1 / 1.8, gain=2.5, phase=radians(45.0), delay=0.0)  # docs/theory.md, "Margins"
 CONTROLLERS = {
     "exact": exact_controller(5.0, 10.0),
-    "reduced": reduced_controller(5.0, 10.0),
+    "reduced": second_order_controller(5.0, 10.0),
     "integrator": TransferFunction((17.0,), (1.0, 0.0)),
 }
 EACH = pytest.mark.parametrize("form", CONTROLLERS)
@@ -71,7 +71,7 @@ def test_the_exact_controller_makes_the_loop_t_and_the_reduced_one_matches_three
     exact, frequency = exact_controller(loop, low_pass), np.geomspace(0.01, 1000, 50)
     c, l_response = exact.frequency_response(frequency), butterworth(low_pass).frequency_response(frequency)
     np.testing.assert_allclose(c / (1 + l_response * c), butterworth(loop).frequency_response(frequency), rtol=1e-9)
-    np.testing.assert_allclose(moments(reduced_controller(loop, low_pass)), moments(exact), rtol=1e-9)
+    np.testing.assert_allclose(moments(second_order_controller(loop, low_pass)), moments(exact), rtol=1e-9)
 
 
 @EACH
@@ -99,7 +99,7 @@ def test_tustin_gives_the_printed_digits_and_is_exact_at_the_prewarped_frequency
     b, a = as_filter(loop_section(5.0, 10.0, RATE))
     np.testing.assert_allclose(b, 1.3043570e-5 * np.array([1, 2, 1]), rtol=0, atol=1e-12)
     np.testing.assert_allclose(a, [1, -1.9823849911, 0.9823849911], rtol=0, atol=5e-11)
-    continuous = reduced_controller(5.0, 10.0)
+    continuous = second_order_controller(5.0, 10.0)
     for found, known in zip((b, a), bilinear(continuous.numerator, continuous.denominator, RATE), strict=True):
         np.testing.assert_allclose(found, known, rtol=1e-9)
     b, a = StarSTDFT(bandwidth=10.0, rate=RATE).coefficients
@@ -112,12 +112,12 @@ def test_a_section_keeps_every_coefficient_however_slow(width):
     """The numerator of a slow loop at the rate of a sound card is 1e-19 (1 + z^-1)^2."""
     b, _ = as_filter(loop_section(width, 2 * width, 96e3))
     np.testing.assert_allclose(b / b[0], [1, 2, 1], rtol=1e-12)
-    assert b[0] == pytest.approx(reduced_controller(width, 2 * width)(2 * 96e3), rel=1e-12)
+    assert b[0] == pytest.approx(second_order_controller(width, 2 * width)(2 * 96e3), rel=1e-12)
 
 
 @pytest.mark.parametrize(
     ("loop", "delay"),
-    [(reduced_controller(5.0, 10.0) * L, MOST_DELAY / 5.0), (CONTROLLERS["integrator"], MOST_INTEGRAL / 17.0)],
+    [(second_order_controller(5.0, 10.0) * L, MOST_DELAY / 5.0), (CONTROLLERS["integrator"], MOST_INTEGRAL / 17.0)],
     ids=["loop and low pass", "integrator"],
 )
 def test_the_longest_delay_is_where_the_least_margins_end(loop, delay):
@@ -141,7 +141,7 @@ def test_a_loop_is_a_quarter_of_the_carrier_or_as_wide_as_its_delay_allows():
     for found, each in ((loop_of(1)[0], 5.0), (settings, width)):
         assert found["loop"] == loop_section(each, 2 * each, RATE)
     for each, kept in ((width, True), (width / 0.9, False)):
-        margins = loop_margins(reduced_controller(each, 2 * each) * butterworth(2 * each), delay)
+        margins = loop_margins(second_order_controller(each, 2 * each) * butterworth(2 * each), delay)
         assert (LEAST.complaint(margins) == "") is kept
 
 

@@ -14,6 +14,7 @@ from board import (
     RATE,
     ROOT,
     SCENE,
+    BoardProcess,
     SteppedBoard,
     build_board,
     program_of,
@@ -36,6 +37,13 @@ ROUNDING = 2.0**-24  # relative, of float32
 def test_the_board_as_a_process_prints_its_usage():
     found = subprocess.run([program_of("-O2")], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr.partition(" [")[0]) == (2, "usage: board LINK")
+
+
+def test_the_verb_latency_states_the_delay_of_a_boards_design(tmp_path, capsys):
+    delay = hr.prepare(SCENE).model.delay
+    with BoardProcess(program_of("-O2"), tmp_path) as board:
+        assert main(["latency", "--driver", f"serial:{board.port}"]) == 0
+    assert f"the delay is stated by the design of the board: {delay} samples at 5000 Hz" in capsys.readouterr().out
 
 
 @pytest.fixture

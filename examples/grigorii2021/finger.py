@@ -13,7 +13,7 @@ import numpy as np
 
 from examples.grigorii2021.claims import Array, Claim, Curve, Item, Panel
 from examples.grigorii2021.formulas import FILTER, FREQUENCIES, FREQUENCY, GRID, LOOP
-from examples.grigorii2021.shaping import TransferFunction, analyse, butterworth, reduced_controller
+from examples.grigorii2021.shaping import TransferFunction, analyse, butterworth, second_order_controller
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY, HEAVY_SECOND, LIGHT, LIGHT_SECOND, FingerMechanics
 
@@ -70,7 +70,7 @@ def _bandwidth_lost(parameters: PlateParameters, frequency: float) -> tuple[floa
     gain = float(_one_mass(parameters, frequency, parameters.damping_1 + parameters.damping_2))
     mode, ratio = (float(values[1]) for values in parameters.modes())
     resonant = abs(frequency - mode) < mode * ratio
-    law, low_pass = reduced_controller(LOOP, FILTER), butterworth(FILTER)
+    law, low_pass = second_order_controller(LOOP, FILTER), butterworth(FILTER)
     weak = TransferFunction(tuple(gain * each for each in law.numerator), law.denominator)
     free, held = (
         analyse(each, low_pass, amplitude_pole=width * mode * ratio if resonant else None).bandwidth

@@ -19,7 +19,7 @@ from examples.grigorii2021.shaping import (
     analyse,
     butterworth,
     exact_controller,
-    reduced_controller,
+    second_order_controller,
 )
 from hapticrender.plants.plate import PlateParameters
 
@@ -37,7 +37,7 @@ def decibel(values: Array) -> Array:
 
 def controller() -> Item:
     """Compare the controller C and the closed loop T, exact and reduced to second order."""
-    laws = {"exact": exact_controller(LOOP, FILTER), "2nd order": reduced_controller(LOOP, FILTER)}
+    laws = {"exact": exact_controller(LOOP, FILTER), "2nd order": second_order_controller(LOOP, FILTER)}
     desired, low_pass = butterworth(LOOP), butterworth(FILTER)
     exact, reduced = laws.values()
     plain, cancelled = _polynomial_controller(desired, low_pass)

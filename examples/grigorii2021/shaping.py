@@ -59,7 +59,7 @@ def butterworth(bandwidth: float) -> TransferFunction:
     return TransferFunction((w**2,), (1.0, sqrt(2) * w, w**2))
 
 
-def reduced_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
+def second_order_controller(loop_bandwidth: float, filter_bandwidth: float) -> TransferFunction:
     """Return the second-order controller that makes the closed loop nearly a Butterworth T (bandwidths in Hz)."""
     gain, pole = loopshape.reduced_controller(loop_bandwidth, filter_bandwidth)
     return TransferFunction((gain * pole,), (1.0, pole, 0.0))

@@ -43,7 +43,7 @@ from hapticrender.protocols import Array, Method
 TABLE_STEP = 0.5  # Hz, resolution of the look-up table
 CONTACT_FADE = 0.02  # s: targets of the polar methods that follow the finger fade in and out with contact
 HIGHEST_EDGE = 1.25  # of the highest frequency, where position-locked carriers have faded out
-MOST_INTEGRAL = 0.613034  # an integrator's gain times the delay: leaves a modulus margin of 1/1.8
+MOST_INTEGRAL = 0.613034  # an integrator's gain times the delay: the least margins of `loopshape.MOST_DELAY`
 ALL_PASS = (1.0, 0.0, 0.0, 0.0, 0.0)
 
 
