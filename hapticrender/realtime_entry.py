@@ -64,7 +64,7 @@ class _Control:
             step=controller.step.address,
             state=controller.state,
             signals=self._signals,
-            analysed=controller.bands.envelope is None,
+            reads_waveform=controller.bands.envelope is None,
             shared=self.shared,
             limit_at=self.limit,
         )

@@ -33,7 +33,7 @@ SLOT = np.dtype(
 screen (its floor over its bias), whether anything plays, the texture's record; how often it has set the finger, and
 called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
-CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "analysed", "shared", "limit_at")])
+CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "shared", "limit_at")])
 """Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
 the state that it shares with others (see `control.state_transfer`); the drive's limit in every channel."""
 CONTROL_T = numba.from_dtype(CONTROL)
@@ -204,7 +204,7 @@ def play_texture(entry, slot):
     waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (size, 2))
     places = carray(pointer(e.places_at, F8), (2, e.block))
     log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
-    analysed = record(e.control, CONTROL_T, 0).analysed > 0
+    reads_waveform = record(e.control, CONTROL_T, 0).reads_waveform > 0
     for m in range(e.block):
         places[0, m], places[1, m] = follow_finger(entry, slot, m)
         e.gain += e.gain_pole * (s.gain - e.gain)
@@ -218,7 +218,7 @@ def play_texture(entry, slot):
         now = e.samples + m
         before, present = shares(entry, now)
         gain, touch = gains[(now + e.ahead) % size, 0], gains[(now + e.ahead) % size, 1]
-        if analysed:
+        if reads_waveform:
             waveform[m] = texture_at(entry, now + e.ahead, places[1, m], gain, touch)
         else:
             waveform[m] = gain * (before + present)

@@ -54,7 +54,7 @@ class NaiveError:
         p, T = self.p, self.T
         good = np.abs(sensed) < p["sensor_limit"]
         y = self.from_sensor @ np.where(good, sensed, 0.0)
-        sane = abs(waveform) <= FAR or not (p["analysed"] or p["modulated"])
+        sane = abs(waveform) <= FAR or not (p["reads_waveform"] or p["modulated"])
         flags = NONFINITE if not good.all() or abs(position) > FAR or not sane else 0
         flags |= SENSOR_CLIPPED if (np.isfinite(sensed) & ~good).any() else 0
         if self.locked:
@@ -151,7 +151,7 @@ class NaiveError:
         """Target, reference R and its slope."""
         p, before = self.p, self.R
         turn = 1j * self.w if p["differentiated"] else 1.0
-        if p["analysed"]:
+        if p["reads_waveform"]:
             e = waveform - (self.raw * carrier).real.sum()
             self.raw = self.raw + crowded_gain * p["waveform_gain"] * e * carrier.conj()
             follow = min(crowded_gain * p["waveform_gain"] / 2, 1.0)

@@ -82,7 +82,7 @@ def take_setpoints(controller):
     """Read the setpoints into the tiles; tables and law are marked stale where a carrier is another one."""
     c = record(controller, CONTROLLER_T, 0)
     p, row = c.p, 8 * W * c.tiles
-    c.moving = 0
+    c.locked = 0
     for t in range(c.tiles):
         b, at = record(c.tiles_at, TILE_T, t), c.setpoints_at + 8 * W * t
         frequency, wavenumber = load(at) + c.shift, load(at + row)
@@ -94,11 +94,11 @@ def take_setpoints(controller):
         put(b, "phase", load(at + 2 * row))
         put(b, "setpoint", setpoint)
         put(b, "response", pair(load(at + 5 * row), load(at + 6 * row)))
-        steady = not (growing or changed or p.analysed > 0.0 or p.modulated > 0.0)
+        steady = not (growing or changed or p.reads_waveform > 0.0 or p.modulated > 0.0)
         b.mode[0] = FIXED if steady else FADING
         if p.needs_contact > 0.0 or some(wavenumber > 0.0):
             b.mode[0] = LOCKED
-            c.moving += 1
+            c.locked += 1
         if changed:
             c.stale = 1
             put(b, "turn", unit(frequency / p.rate))
@@ -208,11 +208,11 @@ def update_targets(controller, signals, first):
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         if b.mode[0] != FIXED:
-            envelope = get(b, "raw") if p.analysed > 0.0 else factor * get(b, "setpoint")
+            envelope = get(b, "raw") if p.reads_waveform > 0.0 else factor * get(b, "setpoint")
             if p.differentiated > 0.0:
                 envelope = get(b, "omega") * pair(-1.0 * imag(envelope), real(envelope))
             target = get(b, "weight") * envelope
-            if p.analysed > 0.0:
+            if p.reads_waveform > 0.0:
                 target = get(b, "target") + follow * (target - get(b, "target"))
             put(b, "target", target)
             last, reference = get(b, "r"), get(b, "response") * target

@@ -77,7 +77,7 @@ class BankController(Addressed):
         } | (arrays or {})
         self._arrays = memory
         places = {f"{name}_at": array for name, array in memory.items() if f"{name}_at" in (CONTROLLER.names or ())}
-        start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "moving": 1}
+        start: dict[str, float] = {"tiles": tiles, "bands": self.n_bands, "history": history, "stale": 1, "locked": 1}
         start |= {"scale": 1.0, "confidence": 1.0, "damper_scale": 1.0, "unlocked": 1.0, "response_gain": math.nan}
         self.state = record_of(CONTROLLER, **start, **places)
         for name, value in {**settings, "group": group, "groups": groups}.items():
@@ -204,7 +204,7 @@ def shared_settings(
         "middle": 1.0,
         "lowest": float(model.lowest_frequency),
         "highest": float(min(model.highest_frequency, 0.4 * model.rate)),
-        "analysed": bands.envelope is None,
+        "reads_waveform": bands.envelope is None,
         "modulated": bands.modulated,
         "differentiated": bands.differentiated,
         "sensor_limit": float(model.sensed_limit),

@@ -74,7 +74,7 @@ def bands_ahead(controller, lead):
 def take_reference(controller, inverse, waveform):
     """Put the reference of the look-ahead into the window; find what the sensors should show of it now."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    if c.p.analysed > 0.0:
+    if c.p.reads_waveform > 0.0:
         if abs(waveform) <= c.p.sensor_limit:  # else it is held
             v.last_waveform = waveform
         value = v.last_waveform
@@ -270,7 +270,7 @@ def inverse_step(state, signals, start, count):
     position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
         implausible = sense_block(state, signals, n)
-        if c.moving == 0:
+        if c.locked == 0:
             track_finger(state, position[n])
         y0, y1 = samples[Y, 0], samples[Y + 1, 0]
         if c.bands > 0:
@@ -279,7 +279,7 @@ def inverse_step(state, signals, start, count):
         else:
             c.sample += 1
         learning = follow_contact(state, inverse)
-        take_reference(state, inverse, waveform[n] if c.p.analysed > 0.0 else 0.0)
+        take_reference(state, inverse, waveform[n] if c.p.reads_waveform > 0.0 else 0.0)
         error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0  # from here on forces: the damper's first
         if update_confidence(state, implausible):

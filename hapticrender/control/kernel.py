@@ -63,7 +63,7 @@ def sense_block(controller, signals, first):
     p, block = c.p, c.p.block
     sensed, flags = pointer(io.sensed, F8), pointer(io.flags, I8)
     position, waveform = pointer(io.position, F8), pointer(io.waveform, F8)
-    reads, implausible = p.analysed > 0.0 or p.modulated > 0.0, 0
+    reads, implausible = p.reads_waveform > 0.0 or p.modulated > 0.0, 0
     for m in range(block):
         n = first + m
         raised = 0
@@ -83,7 +83,7 @@ def sense_block(controller, signals, first):
         samples[WAVEFORM, m] = value if sane else 0.0
         if raised > 0 or abs(position[n]) > FARTHEST or not sane:
             flags[n] |= raised | NONFINITE
-        if c.moving > 0:
+        if c.locked > 0:
             track_finger(controller, position[n])
         samples[POSITION, m] = c.held_position
     return implausible
@@ -370,7 +370,7 @@ def error_step(state, signals, start, count):
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
         begin(state, signals, n)
-        if c.p.analysed > 0.0:
+        if c.p.reads_waveform > 0.0:
             analyse_sample(state)
         update_targets(state, signals, n)
         adapt_now = c.sample % ADAPTATION_SAMPLES == 0
@@ -393,10 +393,10 @@ def block_step(state, signals, start, count):
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for first in range(start, stop, block):
         begin(state, signals, first)
-        if c.stale > 0 or c.moving > 0 or c.gain != c.response_gain:
+        if c.stale > 0 or c.locked > 0 or c.gain != c.response_gain:
             turn_tables(state)
             invert(state, c.gain)
-        if c.p.analysed > 0.0:
+        if c.p.reads_waveform > 0.0:
             analyse_block(state)
         update_targets(state, signals, first)
         touching = find_contact(state, True)

@@ -97,7 +97,7 @@ def update_law(controller, touching, adapt_now):
     due = contact != c.law_contact or (adapt_now and touching) or c.stale > 0
     if due:
         c.law_contact, c.law_lever = contact, c.lever
-    if not (due or c.moving > 0):
+    if not (due or c.locked > 0):
         return
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)

@@ -213,11 +213,11 @@ def low_pass_step(state, signals, start, count):
         implausible = sense_block(state, signals, n)
         if implausible > 0:  # these methods predict nothing
             samples[Y, 0], samples[Y + 1, 0] = 0.0, 0.0
-        if c.moving > 0:
+        if c.locked > 0:
             velocity = (c.held_position - held) * p.rate if seen > 0.0 else 0.0
             c.table_velocity += follow * (velocity - c.table_velocity)
         advance_carriers(state)
-        if p.analysed > 0.0:
+        if p.reads_waveform > 0.0:
             analyse_sample(state)
         update_targets(state, signals, n)
         if update_confidence(state, implausible):

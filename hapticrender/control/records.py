@@ -77,7 +77,7 @@ LOW_PASS, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, WORK_FIELDS, _complex("z")
 """Work is ordered [tile, coordinate]; a pair is a complex number for each band of a tile."""
 
 _SETTINGS = """
-rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated analysed
+rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated reads_waveform
 needs_contact least_speed sensor_delay contact_lag corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high
@@ -121,7 +121,7 @@ CONTROLLER = np.dtype(
         *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation", "damper_force")),
         ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
-        *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "moving", "stale", "implausible")),
+        *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "locked", "stale", "implausible")),
         *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
 )
