@@ -9,6 +9,7 @@ from strangers_plate import StrangersPlate
 from test_two_touches import HEAVY
 
 import hapticrender as hr
+from hapticrender.driver_checks import OPEN
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.recordings.recording import Recording
 from hapticrender.sampled_texture import FADE
@@ -286,3 +287,20 @@ def test_what_it_refuses(tmp_path):
         for gain in (-0.1, 10.1):
             with pytest.raises(ValueError, match=f"gain = {gain}: must be a finite number >= 0 and <= 10"):
                 player.gain = gain
+
+
+def test_a_driver_that_another_player_has_open_is_refused():
+    """It goes on there, and once that is closed it is free again."""
+    driver = Lying(1e9, "")
+    with hr.Player(driver=driver, paced=False) as first:
+        first.play(TONE)
+        with (
+            hr.Player(driver=driver, paced=False) as second,
+            pytest.raises(ValueError, match="is already open in a Player"),
+        ):
+            second.play(TONE)
+        with pytest.raises(ValueError, match="is already open in a Player or a run: end that one first"):
+            hr.render(hr.Scene(texture=TONE, duration=0.1), driver=driver)
+        first.sleep(0.5)
+        assert first.state().bands[0].error < 0.02
+    assert id(driver) not in OPEN

@@ -18,7 +18,6 @@ import hapticrender.player
 from benchmarks import faults
 from hapticrender.bands import Bands
 from hapticrender.cli import main
-from hapticrender.driver_checks import OPEN
 from hapticrender.process_signals import Terminated
 from hapticrender.recordings.recording import Recording
 
@@ -246,23 +245,6 @@ def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch
         with pytest.raises(hr.HapticError, match="has played no sample"):
             go_on(player)
     stuck.set()
-
-
-def test_a_driver_that_another_player_has_open_is_refused():
-    """It goes on there, and once that is closed it is free again."""
-    driver = Lying(1e9, "")
-    with hr.Player(driver=driver, paced=False) as first:
-        first.play(TONE)
-        with (
-            hr.Player(driver=driver, paced=False) as second,
-            pytest.raises(ValueError, match="is already open in a Player"),
-        ):
-            second.play(TONE)
-        with pytest.raises(ValueError, match="is already open in a Player or a run: end that one first"):
-            hr.render(hr.Scene(texture=TONE, duration=0.1), driver=driver)
-        first.sleep(0.5)
-        assert first.state().bands[0].error < 0.02
-    assert id(driver) not in OPEN
 
 
 class Slow:
