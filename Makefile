@@ -12,7 +12,7 @@ RUN := .venv/bin/python
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
-# Tests that play in real time run last, one after the other, with what the others have compiled on two cores.
+# Tests that play in real time run first, one after the other; the rest on two cores.
 UNPACED := tests/test_player.py tests/test_player_textures.py
 REAL_TIME := tests/test_audio_jack.py tests/test_audio_verbs.py $(filter-out $(UNPACED),$(wildcard tests/test_player*.py)) tests/test_board_live.py
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
@@ -28,8 +28,8 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 	@.venv/bin/hapticrender demo --out $(OUT)
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
-	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
+	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
