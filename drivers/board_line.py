@@ -60,8 +60,8 @@ class BoardLine:
     """A session with a board, on a port of its own; not for several threads at once.
 
     It greets the board, sends keep-alives, and one command at a time until its reply.  Its parameters are those of
-    `BoardClient`.  A `DeviceNotFound` where the port cannot be opened, a `DeviceTimeout` where nothing answers in the
-    protocol, a `ProtocolError` where what answers has another version of it.
+    `BoardClient`.  A `DeviceNotFound` where the port cannot be opened, a `DeviceTimeout` where no reply in the
+    protocol comes, a `ProtocolError` where the board has another version of it.
     """
 
     capabilities: Capabilities  # from the reply to HELLO on
