@@ -23,6 +23,7 @@ from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
 SIGMAS, DRIVE_ERROR = 8.0, 2.0  # of noise; of the force that the drive may make, over that assumed
+QUIET = 64  # samples at the start, before the drive has risen, that show the noise of the sensor
 LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % at half as much again
 
 
@@ -73,6 +74,7 @@ class ResonantDriver(WrappedDriver):
         self._drive = np.zeros((driver.block, 1))
         self._next = np.zeros((driver.block, 1))
         self._last = np.full(2, np.nan)  # m: the last two samples
+        self._quiet = np.zeros(0)  # m: differences of the first samples, see `_jumps`
         self._peaks = deque([0.0], maxlen=2 + driver.delay // driver.block)  # V: of the blocks that act
         self._jumped: Fault | None = None
 
@@ -159,19 +161,25 @@ class ResonantDriver(WrappedDriver):
 
         A drive u adds N u T^2/m at most, and what decays w T/Q of the amplitude, 1/9 where a finger damps most.  A gain
         that changes by g makes (g - 1) y_n, then (1 - g) y_n-1, of which one is at least |g - 1| sin(w T/2) of it; half
-        of that for 1/3 is the bound.  Nothing is compared where a converter holds its values, or samples were lost.
+        of that for 1/3 is the bound.  Noise is what is stated, or the first `QUIET` samples show.  Nothing is compared
+        where a converter holds its values, or samples were lost.
         """
         mode, lost = self.parameters.mode, sensed.flags is not None and bool((sensed.flags & Flag.OVERRUN).any())
         y = np.r_[np.full(2, np.nan) if lost else self._last, sensed.sensed[:, 0]]
         self._last, turn = y[-2:], 2 * np.pi * mode.frequency / self.driver.rate
         twice = 2 * math.cos(turn)
-        noise = SIGMAS * math.sqrt(2 + twice**2) * (mode.sensor_noise + mode.sensor_step)
-        driven = DRIVE_ERROR * mode.force_constant * max(self._peaks) / (mode.modal_mass * self.driver.rate**2)
-        with np.errstate(invalid="ignore"):  # no numbers are the supervisor's
+        with np.errstate(invalid="ignore", over="ignore"):  # no numbers are the supervisor's
+            change = y[2:] - twice * y[1:-1] + y[:-2]
             squares = y[1:-1] ** 2 + y[:-2] ** 2 - twice * y[1:-1] * y[:-2]
-            bound = noise + driven + math.sin(turn / 2) / 3 * np.sqrt(np.maximum(squares, 0.0)) / abs(math.sin(turn))
-            moves = (y[2:] != y[1:-1]) & (y[1:-1] != y[:-2])
-            return bool((moves & (abs(y[2:] - twice * y[1:-1] + y[:-2]) > bound)).any())
+            size = np.sqrt(np.maximum(squares, 0.0)) / abs(math.sin(turn))
+        if len(self._quiet) < QUIET:
+            self._quiet = np.r_[self._quiet, change[np.isfinite(change)]]
+            return False
+        stated = math.sqrt(2 + twice**2) * (mode.sensor_noise + mode.sensor_step)
+        noise = SIGMAS * max(stated, math.sqrt(np.mean(self._quiet**2)))
+        driven = DRIVE_ERROR * mode.force_constant * max(self._peaks) / (mode.modal_mass * self.driver.rate**2)
+        moves = (y[2:] != y[1:-1]) & (y[1:-1] != y[:-2])
+        return bool((moves & (abs(change) > noise + driven + math.sin(turn / 2) / 3 * size)).any())
 
     def _sensed(self, friction: Array, played: list[Sensed], flags: Array) -> Sensed:
         """Measurements of the finger and flags, once a sample of friction; the mode's motion is left out."""

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 from electroadhesive import Screen
+from live_devices import Told
 from scipy.signal import step
 from test_ultrasonic_rendering import watched
 
 import hapticrender as hr
 from hapticrender.control.supervisor_kernel import JUMP_NEIGHBOURS
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL
-from hapticrender.plants.ultrasonic import UltrasonicParameters
+from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 
 START = 0.3  # s: when the sensor fails
 ZERO = 2e-3  # s from the stop to zero drive
@@ -135,6 +136,7 @@ def test_a_vibration_that_jumps_is_found_at_any_phase_and_a_healthy_one_never_ju
     mode = driver.parameters.mode
     worst = mode.damping() + 3.0 * (mode.damping(15.0) - mode.damping())
     jumps = lambda values: driver._jumps(hr.Sensed(values[:, None]))  # noqa: E731
+    assert not jumps(2e-9 * rng.standard_normal(100))  # at rest, before all else
     turns = 2 * np.pi * (mode.frequency - 60.0) / driver.driver.rate * np.arange(32)  # off by two half widths
     for phase in np.arange(0, 2 * np.pi, 0.1):
         steady = 0.9e-6 * np.cos(turns + phase) + 2e-9 * rng.standard_normal(32)
@@ -148,6 +150,15 @@ def test_a_vibration_that_jumps_is_found_at_any_phase_and_a_healthy_one_never_ju
             driver._last[:] = np.nan
             values = 0.9e-6 * decay * np.cos(turns + rng.uniform(0, 6.3)) + 2e-9 * rng.standard_normal(32)
             assert not jumps(values)
+
+
+@pytest.mark.parametrize("noise", [10e-9, 40e-9])
+def test_a_sensor_that_is_noisier_than_stated_is_no_jump(noise):
+    """2 nm are stated."""
+    device = Told(UltrasonicPlate(UltrasonicParameters(delay=16, sensor_noise=noise), FINGER, block=16))
+    texture = hr.Grating(frequency=100.0, velocity=10e-3)
+    recording = hr.render(hr.Scene(texture=texture, finger=FINGER, device="ultrasonic", duration=0.6), driver=device)
+    assert not (recording.flags & hr.Flag.STOPPED).any()
 
 
 @pytest.mark.parametrize("damping", [0.44, 0.65, 1.0])
