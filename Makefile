@@ -9,6 +9,8 @@ PROBE := import ensurepip, sys; sys.exit(sys.version_info < (3, 11))
 PYTHON = $(shell for candidate in python3 python3.13 python3.12 python3.11; do \
 	"$$candidate" -c '$(PROBE)' 2>/dev/null && { echo "$$candidate"; break; }; done)
 RUN := .venv/bin/python
+# On the path itself: a folder of the name `hapticrender`, as a clone has, would else be the package for scripts beside it.
+INSTALL := $(RUN) -m pip install --quiet --disable-pip-version-check --config-settings editable_mode=compat --editable
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
@@ -88,20 +90,20 @@ clean: ## remove the environment and everything that was built or written
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml
 	@echo "installing hapticrender into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all]'
+	@$(INSTALL) '.[all]'
 	@touch $@
 
 .venv/test.stamp: .venv/made.stamp pyproject.toml
 	@echo "installing hapticrender and its test tools into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test]'
+	@$(INSTALL) '.[all,test]'
 	@touch $@ .venv/demo.stamp
 
 .venv/bench.stamp: .venv/made.stamp pyproject.toml
 	@echo "installing what tests need and benchmarks compare with into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,test,bench]'
+	@$(INSTALL) '.[all,test,bench]'
 	@touch $@ .venv/test.stamp .venv/demo.stamp
 
 .venv/docs.stamp: .venv/demo.stamp
 	@echo "installing pdoc into .venv"
-	@$(RUN) -m pip install --quiet --disable-pip-version-check --editable '.[all,docs]'
+	@$(INSTALL) '.[all,docs]'
 	@touch $@

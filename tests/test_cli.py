@@ -475,3 +475,10 @@ def test_no_scene_file_ever_makes_a_traceback(run, tmp_path_factory, text):
     else:
         assert complaint(result).startswith(f"hapticrender: {path}: ")
         assert not (folder / "out").exists()
+
+
+def test_a_script_beside_a_clone_finds_the_package(tmp_path):
+    """The clone's folder has the package's name, and is none."""
+    (tmp_path / "hapticrender").mkdir()
+    (tmp_path / "script.py").write_text("import hapticrender; hapticrender.Grating, hapticrender.Player")
+    subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True)
