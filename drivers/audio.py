@@ -179,8 +179,9 @@ class AudioDriver(BaseDriver):
             raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
         latency = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
         seconds = {"low": own[0], "high": own[1]}.get(latency, latency)
-        if not isinstance(seconds, int | float):
-            raise ValueError(f"latency={self.latency!r}: must be 'low', 'high' or seconds, or a pair of them")
+        if not isinstance(seconds, int | float) or not 0.0 <= seconds <= LONGEST:
+            bound = f"'low', 'high' or 0 to {LONGEST:g} s, or a pair of them"
+            raise ValueError(f"latency={self.latency!r}: must be {bound}")
         return card.index, max(channels), float(seconds)
 
     def _settle(self) -> None:
@@ -309,7 +310,7 @@ class AudioDriver(BaseDriver):
 
 def _channels(name: str, given: Any) -> Channels:
     """Check channel numbers as they are printed on the card, from 1 on."""
-    channels = tuple(given)
+    channels = tuple(np.atleast_1d(given))
     whole = all(isinstance(each, int | np.integer) and each >= 1 for each in channels)
     if not whole or len(set(channels)) < len(channels):
         raise ValueError(f"{name}={given!r}: must be different whole numbers >= 1")

@@ -27,6 +27,7 @@ MICROSECOND = 1e-6  # s: times that differ by less are the same
 RESEND = 0.03  # s after which a command without a reply is sent again
 FOREIGN = 3  # replies for another session in a row after which ours has ended
 MOST_STREAM = 4096  # frames of the stream that wait for the caller
+SHOWN = 16  # bytes of a command in an error
 
 
 class Line(NamedTuple):
@@ -79,7 +80,7 @@ class BoardLine:
         try:
             self._port = connect(port, baud)
         except (OSError, ValueError) as error:
-            raise DeviceNotFound(f"{port}: open: {error}") from error
+            raise DeviceNotFound(f"{port}: open: {error}; `hapticrender devices` lists the ports") from error
         self._nonce, self.session = secrets.randbelow(2**32 - 1) + 1, 0  # apart from earlier ones; 0: not greeted
         self.telemetry: Telemetry | None = None
         self.streamed: deque[Stream] = deque(maxlen=MOST_STREAM)
@@ -212,9 +213,12 @@ class BoardLine:
         if request.refused is None:
             return request
         text = f"{self.port}: {request.kind.name}: refused by the board: {request.refused.name.lower()}"
+        payload = f"{request.payload[:SHOWN].hex(' ')}, {len(request.payload)} bytes"
         if request.refused == Reason.VALUE:
-            raise ValueError(f"{text}: a number is out of its range ({request.payload.hex(' ')})")
-        raise DriverError(f"{text} ({request.payload.hex(' ')})")
+            raise ValueError(f"{text}: a number is out of its range ({payload})")
+        if request.refused == Reason.STATE:
+            text += ": nothing is set, it plays already, or is at rest after 80 ms without a frame: begin again"
+        raise DriverError(f"{text} ({payload})")
 
     def due(self, now: float) -> bytes:
         """Bytes to be sent at `now` (s)."""

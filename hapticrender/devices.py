@@ -10,6 +10,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticrender.errors import DriverError, HapticError
@@ -67,6 +68,8 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
     if text == SIMULATED:
         return None
     name, colon, argument = text.partition(":")
+    if name == SIMULATED:
+        raise ValueError(f"driver = {text!r}: must be {SIMULATED!r}, without an argument")
     if name in _points("drivers"):
         factory = registered("drivers", name)
     else:
@@ -153,12 +156,13 @@ def _split(argument: str, factory: Callable[..., Any]) -> tuple[str, dict[str, A
     """Split "0?block=256&channels=3,4" into argument and options of the factory; any other "?" is of the argument."""
     before, mark, after = argument.rpartition("?")
     pairs = [each.partition("=") for each in after.split("&")]
-    if not mark or not all(equals for _, equals, _ in pairs):
+    if not mark or not all(equals for _, equals, _ in pairs) or Path(argument).exists():
         return argument, {}
     options: dict[str, Any] = {name: value for name, _, value in pairs}
     taken = inspect.signature(factory).parameters
-    if not (options.keys() <= taken.keys() or any(each.kind is each.VAR_KEYWORD for each in taken.values())):
-        return argument, {}
+    if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):
+        for name in options.keys() - taken.keys():
+            raise ValueError(f"option {name!r}: must be one of {', '.join(taken)}")
     for name, value in options.items():
         with suppress(ValueError, SyntaxError):  # a word
             options[name] = ast.literal_eval(value)

@@ -85,11 +85,12 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     nothing; a DriverError where nothing of what was played is sensed, samples were lost in most of the runs, or the
     runs disagree.
     """
-    if runs < 1 or not 0 < amplitude < np.inf:
-        raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and finite and > 0")
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
     again = hasattr(driver, "loop_back")  # a new driver for every run
+    most = 1.0 if again else getattr(driver, "drive_limit", np.inf)
+    if runs < 1 or not 0 < amplitude < np.inf or amplitude > most:
+        raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and > 0 and <= {most:g}, the limit of the drive")
     if not (again or driver.sensed_channels):
         raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
     rng, trips, tries = np.random.default_rng(0), list[Trip](), 0

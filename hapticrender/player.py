@@ -347,9 +347,9 @@ class Player(Addressed):
         driver: Any = open_driver(given, scenes[0].device_profile) if isinstance(given, str) else given
         live = driver.live() if hasattr(driver, "live") else driver
         try:
-            rendering = prepare(scenes[0], driver=live)
+            rendering = prepare(scenes[0], driver=live, compiled=False)
             if live is not driver and not is_called_back(rendering):  # a thread plays it, later than a callback
-                rendering = prepare(scenes[0], driver=driver)
+                rendering = prepare(scenes[0], driver=driver, compiled=False)
             return self._start(rendering, scenes[1:])
         except BaseException as error:
             with noted_on(error), self._stack:  # what has been opened is left at rest

@@ -192,9 +192,14 @@ def test_block_and_rate_are_options_of_the_text():
     profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0})
     assert open_driver("audio:0?drive_per_full_scale=1.5", profile).drive_limit == 1.5
     assert str(open_driver("audio:0?block=64")) == "audio:0"
-    assert open_driver("audio:what?blok=64").device == "what?blok=64"  # no option of a card: a part of its name
-    with pytest.raises(ValueError, match="block='many' must be a whole number >= 1"):
-        open_driver("audio:0?block=many")
+    assert open_driver("audio:0?channels=1").channels == (1,)
+    for options, refused in (
+        ("blok=64", "option 'blok': must be one of device, channels"),
+        ("block=many", "block='many' must be a whole number >= 1"),
+        ("channels=0", r"channels=0: must be different whole numbers >= 1"),
+    ):
+        with pytest.raises(ValueError, match=refused):
+            open_driver(f"audio:0?{options}")
 
 
 @pytest.mark.parametrize(
@@ -311,8 +316,8 @@ def test_what_is_no_delay_is_refused(driver, message):
 
 
 def test_arguments_of_the_measurement_are_checked():
-    for arguments in ({"runs": 0}, {"amplitude": 0.0}, {"amplitude": np.nan}):
-        with pytest.raises(ValueError, match="must be >= 1, and finite and > 0"):
+    for arguments in ({"runs": 0}, {"amplitude": 0.0}, {"amplitude": np.nan}, {"amplitude": 1.1}):
+        with pytest.raises(ValueError, match="must be >= 1, and > 0 and <= 1, the limit of the drive"):
             measure_latency(Cable(100), **arguments)
 
 

@@ -74,6 +74,7 @@ def test_a_calibration_that_a_driver_object_does_not_have_is_named(stated, attri
 
 REFUSED = [
     ("tea", ValueError, "driver 'tea' is not installed: must be one of .*simulated.*; or NAME, NAME:ARGUMENT"),
+    ("simulated:x", ValueError, "driver = 'simulated:x': must be 'simulated', without an argument"),
     ("tea:cup", ValueError, "driver = 'tea:cup': No module named 'tea'; installed are .*wavefile"),
     ("test_devices:Tea", ValueError, "has no attribute 'Tea'"),
     ("test_devices:NOT_CALLABLE", ValueError, "NOT_CALLABLE is a int: must be a class or a function"),

@@ -112,7 +112,7 @@ class DeviceProfile(Validated):
         """Make a profile from the tables of its file; a ValueError or TypeError names the entry that is wrong."""
         known = ("profile", "device", "uncertainty", "calibration", "limits")
         for key, value in table.items():
-            bound = f"one of the tables {', '.join(known)}"
+            bound = f"one of the tables {', '.join(known)}; a scene's file is read by hr.Scene.from_toml"
             checks.require(key in known and isinstance(value, Mapping), checks.plain(key), value, bound)
         head, device = table.get("profile", {}), dict(table.get("device", {}))
         with checks.inside("profile"):
