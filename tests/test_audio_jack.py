@@ -55,8 +55,8 @@ def test_portaudio_is_what_is_declared(connected):
     assert card.host == "JACK Audio Connection Kit"
     assert all(0 <= low <= high < 1 for low, high in (card.input_latency, card.output_latency))
     with portaudio.initialised() as library:
-        info = library.Pa_GetDeviceInfo(card.index).contents
-        host = library.Pa_GetHostApiInfo(info.hostApi).contents
+        info = library.Pa_GetDeviceInfo(card.index)
+        host = library.Pa_GetHostApiInfo(info.hostApi)
         assert (info.structVersion, host.structVersion, host.type) == (2, 1, JACK)
         assert card.index < library.Pa_GetDeviceCount()
         assert host.deviceCount >= 2
