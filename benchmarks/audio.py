@@ -78,7 +78,7 @@ def print_ring(device: jack_ring.Device, folder: Path, freewheel: bool) -> None:
             time.sleep(10)
         load, lost = live.cpu_load, live.overruns
         live.stop()
-        errors = jack_ring.relative_errors(device, folder / "record", live.last_sensed, entry.samples)[0]
+        errors = jack_ring.relative_errors(device, folder / "record", entry)[0]
     amplitude, phase = abs(abs(1 + errors) - 1).max(), abs(np.angle(1 + errors, deg=True)).max()
     mode = "freewheel" if freewheel else "real time"
     print(

@@ -33,10 +33,10 @@ Channels = tuple[int, ...]
 class AudioDriver(BaseDriver):
     """Plays on a sound card through PortAudio, block by block, or between `start` and `stop` by a compiled callback.
 
-    `play` serves `hapticrender.render` and identification.  Python computes its blocks, so it adds `queued` samples to
-    the delay.  Where the card or Python has lost samples the block has `Flag.OVERRUN`, `overruns` counts, and the delay
-    stays the same.  The callback does not wait for Python; `live` makes the driver whose `delay` is that of the card
-    alone, for which a controller that is called back is designed.  The stream runs from `open` to `close`; while
+    `play` serves `hapticrender.render` and identification.  Python computes its blocks, so it adds `host_delay` samples
+    to the delay.  Where the card or Python has lost samples the block has `Flag.OVERRUN`, `overruns` counts, and the
+    delay stays the same.  The callback does not wait for Python; `live` makes the driver whose `delay` is that of the
+    card alone, for which a controller that is called back is designed.  The stream runs from `open` to `close`; while
     nothing is played, the outputs are zero.
 
     Parameters
@@ -103,29 +103,20 @@ class AudioDriver(BaseDriver):
         self._entry: Any = None
         self._number, self._late = 0, 0  # of the next block of `play`; `play`s in a row whose drive came too late
         self._lost = self._before = 0  # blocks that lost samples; the relay's overruns at `start`
+        self.host_delay = (1 + AHEAD) * block  # of `delay`: the block that Python computes, and those that wait
         super().__init__(
             rate=rate,
             drive_channels=len(self.channels),
             sensed_channels=len(self.inputs),
             block=block,
-            delay=(1 + AHEAD) * block + (block if delay is None else int(np.floor(delay + 0.5))),
+            delay=self.host_delay + (block if delay is None else int(np.floor(delay + 0.5))),
         )
         self.play_delay = self.delay
-
-    @property
-    def queued(self) -> int:
-        """Samples that `play` adds to the card's own delay: the block that Python computes, and those that wait."""
-        return (1 + self._ahead) * self.block
-
-    @property
-    def host_delay(self) -> int:
-        """Samples of `delay` that the card itself does not have: `queued`, of a driver for `play`; else 0."""
-        return self.delay - (self.play_delay - self.queued)
 
     def live(self) -> "AudioDriver":
         """Make the same driver for a compiled controller: its `delay` is the card's, `play_delay` is that of `play`."""
         driver = copy.copy(self)
-        driver.delay = self.play_delay - self.queued
+        driver.delay, driver.host_delay = self.delay - self.host_delay, 0
         return driver
 
     def loop_back(self) -> "AudioDriver":
@@ -134,7 +125,7 @@ class AudioDriver(BaseDriver):
         channels, inputs = self.channels[:1], (self.inputs or (1,))[:1]
         scales = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0}
         driver = AudioDriver(self.device, channels, inputs, **options, **scales)
-        driver._ahead = FAR_AHEAD
+        driver._ahead, driver.host_delay = FAR_AHEAD, (1 + FAR_AHEAD) * self.block
         return driver
 
     @staticmethod
@@ -276,11 +267,6 @@ class AudioDriver(BaseDriver):
             self._stream = None
             stream.close()
             atexit.unregister(self.close)
-
-    @property
-    def last_sensed(self) -> Array:
-        """Samples that the last call of the entry got, float32 of shape (block, sensed_channels), full scale 1."""
-        return self._relay.sensed
 
     @property
     def active(self) -> bool:

@@ -24,7 +24,7 @@ RELAY = np.dtype(
     [
         *((name, np.int64) for name in ("function", "argument", "block", "sensors", "channels", "wide_in", "wide_out")),
         *((name, np.int64) for name in ("inputs_at", "outputs_at", "sensed_at", "drive_at")),
-        *((name, np.int64) for name in ("calls", "blocks", "overruns", "clipped", "odd")),
+        *((name, np.int64) for name in ("calls", "blocks", "overruns", "clipped")),
     ]
 )
 RELAY_T = numba.from_dtype(RELAY)
@@ -84,9 +84,7 @@ def _relay(given, played, frames, time, status, relay):
     out[:] = np.float32(0.0)
     r.calls += 1
     function = fetch_add(relay + FUNCTION_AT, 0)
-    if count != r.block:
-        r.odd += 1
-    elif function != 0:
+    if count == r.block and function != 0:
         r.overruns += (status & LOST) != 0
         gather(relay, given, count)
         call(function, (r.sensed_at, r.drive_at, frames, time, status, r.argument))
@@ -148,13 +146,8 @@ class Relay:
         """Play zeros from the next call on; the function may still be in its last one."""
         counted(self.user_data + FUNCTION_AT, -self.count("function"))
 
-    @property
-    def sensed(self) -> Array:
-        """Samples of the last block as the function got them, float32 of shape (block, sensors), full scale 1."""
-        return self._arrays["sensed"][:, : int(self._record["sensors"][0])].copy()
-
     def count(self, name: str) -> int:
-        """Calls (`calls`; `odd`: not of a block), `blocks` filled, `overruns` before them, samples cut (`clipped`)."""
+        """Calls (`calls`), `blocks` filled, `overruns` before them, samples cut (`clipped`)."""
         return int(self._record[name][0])
 
 

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -45,13 +45,11 @@ class Rows:
     """Rows of a run: drive (A), sensed (m), position (m), load (N), reference (m) and flags.
 
     A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.  `first` is the sample of the board's
-    clock from which on it streams, that of the first row that comes unless given; `stride` the samples between two
-    rows, 0 where none are streamed.
+    clock from which on it streams, that of the first row that comes unless given.
     """
 
-    def __init__(self, first: int | None = None, stride: int = 1) -> None:
-        self._stride = stride or 1
-        self._next = None if first is None else -(-first // self._stride) * self._stride
+    def __init__(self, first: int | None = None) -> None:
+        self._next, self._stride = first, 1  # sample of the next row, or one up to a stride before it
         self._rows: list[Array] = []
         self._last: Array | None = None
         self._broken = False  # rows were lost; their number is unknown
@@ -62,14 +60,15 @@ class Rows:
     def restart(self, first: int) -> None:
         """Go on with the same rows after the board began anew at sample `first`, on a clock that may be another."""
         if self._missing(first) >= LONGEST_GAP:
-            self._next, self._broken = -(-first // self._stride) * self._stride, True
+            self._next, self._broken = first, True
 
     def _missing(self, first: int) -> int:
         return 0 if self._next is None else (first - self._next) % WRAP // self._stride
 
     def add(self, block: Stream) -> None:
         """Append the rows of a frame, after those that were lost before it."""
-        rows, missing = np.array(block.rows), self._missing(block.first)
+        rows, self._stride = np.array(block.rows), max(block.stride, 1)
+        missing = self._missing(block.first)
         if missing >= LONGEST_GAP or not len(rows):
             return  # of an earlier run
         if self._broken:
@@ -86,16 +85,6 @@ class Rows:
         """Remove and return the first `count` rows, all unless given; shape (n, columns)."""
         found, self._rows = self._rows[:count], self._rows[count:] if count is not None else []
         return np.array(found)
-
-
-class _Setup(NamedTuple):
-    """What the board is to do; sent again to a board that was lost."""
-
-    bands: Bands | None = None
-    texture: BoardTexture | None = None
-    gain: float = 1.0
-    limits: tuple[float, float, float, float] | None = None
-    start: tuple[int, int] | None = None  # fields of START; None: at rest
 
 
 class BoardClient(OpenedInWith):
@@ -141,9 +130,12 @@ class BoardClient(OpenedInWith):
         self.started = 0  # sample of the board's clock at which it last began to play
         self._connect = lambda: BoardLine(port, baud, timeout=timeout, clock=clock, connect=connect)
         self._line: BoardLine | None = None
-        self._setup = _Setup()
+        self._settings: dict[Kind, tuple[float, ...]] = {}  # fields of GAIN and LIMITS; sent again to a board that was
+        self._bands: Bands | None = None  # lost, and so are these,
+        self._texture: BoardTexture | None = None  # and what plays beside them
+        self._start: tuple[int, int] | None = None  # fields of START; None: at rest
         self._runs = False  # something has been started
-        self._rows = Rows()  # streamed back in this run
+        self._rows, self._queued = Rows(), 0  # streamed back in this run; rows of drive that were sent in it
         self._error: HapticError | None = None
         self._beats = self._watchdog = 0  # of the application: its calls; ms, 0: none
         self._background, self._thread = background, threading.Thread()
@@ -152,7 +144,8 @@ class BoardClient(OpenedInWith):
     def open(self) -> Self:
         """Open the port and greet the board; see `BoardLine` for the errors."""
         with self._lock:
-            self._line, self._error, self._setup = self._connect(), None, _Setup()
+            self._line, self._error = self._connect(), None
+            self._settings, self._bands, self._texture, self._start = {}, None, None, None
         self._ending.clear()
         if self._background:
             self._thread = threading.Thread(target=self._run, name=f"board {self.port}", daemon=True)
@@ -189,13 +182,12 @@ class BoardClient(OpenedInWith):
             raise ValueError(f"{len(bands)} bands: must be <= {most} on {self.port}; export the scene with more")
 
         def put(line: BoardLine) -> int:
-            last = self._setup
-            if last.start is not None and (texture or last.texture):  # at rest `start` sends it
-                line.play(texture, last.texture)
+            if self._start is not None and (texture or self._texture):  # at rest `start` sends it
+                line.play(texture, self._texture)
             return line.set_bands(bands)
 
         sample = self._steadily(put)
-        self._setup = self._setup._replace(bands=bands, texture=texture)
+        self._bands, self._texture = bands, texture
         return sample
 
     def finger(self, position: float, velocity: float = 0.0, load: float = 0.0, time: float | None = None) -> None:
@@ -213,13 +205,11 @@ class BoardClient(OpenedInWith):
     @property
     def gain(self) -> float:
         """Factor on all targets, 0 to 1; faded over 20 ms."""
-        return self._setup.gain
+        return self._settings.get(Kind.GAIN, (1.0,))[0]
 
     @gain.setter
     def gain(self, value: float) -> None:
-        value = number("gain", value, least=0.0, most=1.0)
-        self._steadily(lambda line: line.command(Kind.GAIN, value))
-        self._setup = self._setup._replace(gain=value)
+        self._set(Kind.GAIN, number("gain", value, least=0.0, most=1.0))
 
     def limits(
         self, peak: float, rms: float | None = None, seconds: float = 1.0, displacement: float = math.inf
@@ -229,9 +219,11 @@ class BoardClient(OpenedInWith):
         Both are at most the limit of the board's design; rms is `peak` unless given.  So does a sensor beyond
         `displacement` (m) while it plays; the bound of the design holds besides.
         """
-        limits = (peak, peak if rms is None else rms, seconds, displacement)
-        self._steadily(lambda line: line.command(Kind.LIMITS, *limits))
-        self._setup = self._setup._replace(limits=limits)
+        self._set(Kind.LIMITS, peak, peak if rms is None else rms, seconds, displacement)
+
+    def _set(self, kind: Kind, *fields: float) -> None:
+        self._steadily(lambda line: line.command(kind, *fields))
+        self._settings[kind] = fields
 
     def watch(self, seconds: float | None) -> None:
         """Let the board stop permanently where the application is silent for so long, 0.05 to 65 s; None: never.
@@ -260,22 +252,21 @@ class BoardClient(OpenedInWith):
         start = integer("stream", stream, "samples", least=0, most=0xFFFF), period
         integer("telemetry", period, "samples", least=1, most=0xFFFF)
         self.started = self._steadily(lambda line: self._begin(line, start))
-        self._rows = Rows(self.started, start[0])
-        self._setup, self._runs = self._setup._replace(start=start), True
+        self._rows = Rows(self.started)
+        self._start, self._runs = start, True
         return self.started
 
     def _begin(self, line: BoardLine, start: tuple[int, int]) -> int:
-        texture = self._setup.texture
-        if texture is not None:
-            line.play(texture)
+        if self._texture is not None:
+            line.play(self._texture)
         sample = line.begin(Kind.START, *start)
-        if texture is not None:
-            texture.begin(sample, self.clock.monotonic())
+        if self._texture is not None:
+            self._texture.begin(sample, self.clock.monotonic())
         return sample
 
     def stop(self) -> None:
         """Fade out within 10 ms."""
-        self._setup = self._setup._replace(start=None)
+        self._start = None
         self._steadily(lambda line: line.command(Kind.STOP))
         self._runs = False
 
@@ -322,7 +313,7 @@ class BoardClient(OpenedInWith):
         require(len(lines) > 0, "lines", lines, "1 or more")
         samples = round(duration * self.capabilities.rate)
         first = self._steadily(lambda line: line.identify(lines, samples, stride=stream))
-        self._runs, self._rows = True, Rows(first, stream)
+        self._runs, self._rows = True, Rows(first)
         columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
         return self.rows(samples // stream)[:, :columns]
 
@@ -331,15 +322,16 @@ class BoardClient(OpenedInWith):
         self._steadily(lambda line: line.identify([], 0, stride=1))
         with self._lock:
             self._open_line().streamed.clear()  # of a run before this one: no row has been queued yet
-            self._runs, self._rows = True, Rows()
+            self._runs, self._rows, self._queued = True, Rows(), 0
 
-    def queue(self, first: int, drive: Array) -> None:
-        """Append rows of drive (A, shape (n, channels)), the first one of which is number `first` of the queue."""
+    def queue(self, drive: Array) -> None:
+        """Append rows of drive (A, shape (n, channels))."""
         line = self._open_line()
         with self._lock:
             for start in range(0, len(drive), DRIVE_ROWS):
                 rows = np.asarray(drive[start : start + DRIVE_ROWS], "<f4")
-                line.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, first + start) + rows.tobytes())
+                line.send(Kind.DRIVE, protocol.pack(Kind.DRIVE, self._queued) + rows.tobytes())
+                self._queued += len(rows)
 
     def step(self) -> None:
         """Take what has arrived and send what is due; for clients without a thread, at least every 10 ms."""
@@ -348,8 +340,8 @@ class BoardClient(OpenedInWith):
             try:
                 line.carry()
                 self._compare(line)
-                if self._setup.start is not None and self._setup.texture is not None:
-                    line.supply(self._setup.texture)
+                if self._start is not None and self._texture is not None:
+                    line.supply(self._texture)
             except (DeviceFault, WatchdogTimeout) as error:
                 self._error = error
                 raise
@@ -407,14 +399,12 @@ class BoardClient(OpenedInWith):
         raise error
 
     def _restore(self, line: BoardLine) -> None:
-        setup = self._setup
-        if setup.limits is not None:
-            line.command(Kind.LIMITS, *setup.limits)
-        line.command(Kind.GAIN, setup.gain)
-        if setup.bands is not None:
-            line.set_bands(setup.bands)
-        if setup.start is not None:
-            self.started = self._begin(line, setup.start)
+        for kind, fields in self._settings.items():
+            line.command(kind, *fields)
+        if self._bands is not None:
+            line.set_bands(self._bands)
+        if self._start is not None:
+            self.started = self._begin(line, self._start)
             self._rows.restart(self.started)
 
     def _open_line(self) -> BoardLine:

@@ -165,10 +165,7 @@ class BoardLine:
 
     def set_bands(self, bands: Bands) -> int:
         """Send set-points, which act together at the end; return the sample at which the board took them."""
-        payloads = [protocol.pack(Kind.SETPOINT, index, *row) for index, row in enumerate(bands.set_points())]
-        for payload in payloads:
-            self.send(Kind.SETPOINT, payload)
-        return self.command(Kind.COMMIT, len(payloads), protocol.digest(payloads)).sample
+        return self.command(Kind.COMMIT, len(bands), self._staged(Kind.SETPOINT, bands.set_points())).sample
 
     def play(self, texture: BoardTexture | None, meanwhile: BoardTexture | None = None) -> None:
         """Send a texture, and fade into it; `meanwhile` goes on until then.  None: fade out what plays."""
@@ -200,10 +197,14 @@ class BoardLine:
 
     def identify(self, lines: Sequence[Line], samples: int, stride: int) -> int:
         """Start a multisine, or without lines a queue; return the sample at which it began."""
-        payloads = [protocol.pack(Kind.LINE, index, *line) for index, line in enumerate(lines)]
+        return self.begin(Kind.IDENTIFY, len(lines), samples, stride, self._staged(Kind.LINE, lines))
+
+    def _staged(self, kind: Kind, rows: Iterable[Iterable[float]]) -> int:
+        """Send set-points or lines, which act with a later command; return the digest of what the board then holds."""
+        payloads = [protocol.pack(kind, index, *row) for index, row in enumerate(rows)]
         for payload in payloads:
-            self.send(Kind.LINE, payload)
-        return self.begin(Kind.IDENTIFY, len(lines), samples, stride, protocol.digest(payloads))
+            self.send(kind, payload)
+        return protocol.digest(payloads)
 
     def _carried(self) -> str:
         return f"{self.sent_bytes} bytes sent, {self.received_bytes} received"

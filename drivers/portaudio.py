@@ -3,18 +3,19 @@
 The library is the system's (``libportaudio``), or that which the package sounddevice brings on Windows and macOS.
 """
 
-import ctypes
 import os
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from ctypes import CDLL, POINTER, Structure, byref, c_char_p, c_double, c_int, c_ulong, c_void_p, py_object, pythonapi
+from ctypes import py_object, pythonapi
 from ctypes.util import find_library
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, files
 from typing import Any
+
+import cffi
 
 from hapticrender.errors import DeviceNotFound, DriverError
 
@@ -30,65 +31,37 @@ INSTALL = (
 )
 
 
-def _fields(names: str, *kinds: Any) -> tuple[tuple[str, Any], ...]:
-    return tuple(zip(names.split(), kinds, strict=True))
-
-
-class DeviceInfo(Structure):
-    """PaDeviceInfo."""
-
-    _fields_ = (
-        *_fields("structVersion name hostApi maxInputChannels maxOutputChannels", c_int, c_char_p, *[c_int] * 3),
-        *_fields("defaultLowInputLatency defaultLowOutputLatency", c_double, c_double),
-        *_fields("defaultHighInputLatency defaultHighOutputLatency defaultSampleRate", *[c_double] * 3),
-    )
-
-
-class HostApiInfo(Structure):
-    """PaHostApiInfo."""
-
-    _fields_ = (
-        *_fields("structVersion type name", c_int, c_int, c_char_p),
-        *_fields("deviceCount defaultInputDevice defaultOutputDevice", *[c_int] * 3),
-    )
-
-
-class HostErrorInfo(Structure):
-    """PaHostErrorInfo."""
-
-    _fields_ = _fields("hostApiType errorCode errorText", c_int, ctypes.c_long, c_char_p)
-
-
-class StreamParameters(Structure):
-    """PaStreamParameters."""
-
-    _fields_ = (
-        *_fields("device channelCount sampleFormat", c_int, c_int, c_ulong),
-        *_fields("suggestedLatency hostApiSpecificStreamInfo", c_double, c_void_p),
-    )
-
-
-_PARAMETERS, _STREAM = POINTER(StreamParameters), c_void_p
-_OPEN = (POINTER(c_void_p), _PARAMETERS, _PARAMETERS, c_double, c_ulong, c_ulong, c_void_p, c_void_p)
-FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {  # name: result, arguments
-    "Pa_GetVersion": (c_int, ()),
-    "Pa_GetErrorText": (c_char_p, (c_int,)),
-    "Pa_GetLastHostErrorInfo": (POINTER(HostErrorInfo), ()),
-    "Pa_Initialize": (c_int, ()),
-    "Pa_Terminate": (c_int, ()),
-    "Pa_GetDeviceCount": (c_int, ()),
-    "Pa_GetDefaultOutputDevice": (c_int, ()),
-    "Pa_GetDeviceInfo": (POINTER(DeviceInfo), (c_int,)),
-    "Pa_GetHostApiInfo": (POINTER(HostApiInfo), (c_int,)),
-    "Pa_OpenStream": (c_int, _OPEN),
-    "Pa_StartStream": (c_int, (_STREAM,)),
-    "Pa_StopStream": (c_int, (_STREAM,)),
-    "Pa_CloseStream": (c_int, (_STREAM,)),
-    "Pa_IsStreamActive": (c_int, (_STREAM,)),
-    "Pa_GetStreamCpuLoad": (c_double, (_STREAM,)),
-}
-
-
+FFI = cffi.FFI()
+FFI.cdef("""
+    typedef struct {
+        int structVersion; const char *name; int hostApi, maxInputChannels, maxOutputChannels;
+        double defaultLowInputLatency, defaultLowOutputLatency, defaultHighInputLatency, defaultHighOutputLatency;
+        double defaultSampleRate;
+    } PaDeviceInfo;
+    typedef struct {
+        int structVersion, type; const char *name; int deviceCount, defaultInputDevice, defaultOutputDevice;
+    } PaHostApiInfo;
+    typedef struct { int hostApiType; long errorCode; const char *errorText; } PaHostErrorInfo;
+    typedef struct {
+        int device, channelCount; unsigned long sampleFormat; double suggestedLatency; void *hostApiSpecificStreamInfo;
+    } PaStreamParameters;
+    int Pa_GetVersion(void);
+    const char *Pa_GetErrorText(int error);
+    const PaHostErrorInfo *Pa_GetLastHostErrorInfo(void);
+    int Pa_Initialize(void);
+    int Pa_Terminate(void);
+    int Pa_GetDeviceCount(void);
+    int Pa_GetDefaultOutputDevice(void);
+    const PaDeviceInfo *Pa_GetDeviceInfo(int device);
+    const PaHostApiInfo *Pa_GetHostApiInfo(int hostApi);
+    int Pa_OpenStream(void **stream, const PaStreamParameters *input, const PaStreamParameters *output, double rate,
+                      unsigned long frames, unsigned long flags, void *callback, void *userData);
+    int Pa_StartStream(void *stream);
+    int Pa_StopStream(void *stream);
+    int Pa_CloseStream(void *stream);
+    int Pa_IsStreamActive(void *stream);
+    double Pa_GetStreamCpuLoad(void *stream);
+""")
 LEFT_BEHIND: list["Stream"] = []  # streams that PortAudio did not close
 
 
@@ -116,19 +89,16 @@ class Card:
 
 
 @lru_cache
-def load() -> CDLL:
-    """Load PortAudio and declare `FUNCTIONS`; a `DeviceNotFound` where there is none, or one older than 19.6."""
+def load() -> Any:
+    """Load PortAudio; a `DeviceNotFound` where there is none, or one older than 19.6."""
     name = find_library("portaudio") or _bundled()
     if name is None:
         raise DeviceNotFound(f"audio: PortAudio is not installed; {INSTALL}")
     try:
-        loaded = CDLL(name)
-        for function, (result, arguments) in FUNCTIONS.items():
-            declared = getattr(loaded, function)
-            declared.restype, declared.argtypes = result, arguments
+        loaded = FFI.dlopen(name)
+        version = loaded.Pa_GetVersion()
     except (OSError, AttributeError) as error:
         raise DeviceNotFound(f"audio: {name} is no PortAudio that can be used: {error}; {INSTALL}") from error
-    version = loaded.Pa_GetVersion()
     if version < LEAST_VERSION:
         raise DeviceNotFound(f"audio: {name}: version {version:#x} must be >= {LEAST_VERSION:#x} (19.6.0); {INSTALL}")
     return loaded
@@ -149,16 +119,20 @@ def check(code: int, what: str) -> int:
     """Return a result of PortAudio; a `DriverError` that begins with `what` where it is an error."""
     if code >= 0:
         return code
-    text = load().Pa_GetErrorText(code).decode(errors="replace")
+    text = _text(load().Pa_GetErrorText(code))
     if code == HOST_ERROR:
-        host = load().Pa_GetLastHostErrorInfo().contents
-        text = f"{text}: {(host.errorText or b'').decode(errors='replace')} ({host.errorCode})"
+        host = load().Pa_GetLastHostErrorInfo()
+        text = f"{text}: {_text(host.errorText)} ({host.errorCode})"
     reason = ANTICIPATED_ERRORS.get(code)
     raise DriverError(f"{what}: {text} (PortAudio {code}{f': {reason}' if reason else ''})")
 
 
+def _text(found: Any) -> str:
+    return FFI.string(found).decode(errors="replace") if found else ""
+
+
 @contextmanager
-def initialised() -> Iterator[CDLL]:
+def initialised() -> Iterator[Any]:
     """Initialise PortAudio, which lists the cards anew unless it is in use, and terminate it afterwards."""
     portaudio = _initialise("audio")
     try:
@@ -167,7 +141,7 @@ def initialised() -> Iterator[CDLL]:
         portaudio.Pa_Terminate()
 
 
-def _initialise(name: str) -> CDLL:
+def _initialise(name: str) -> Any:
     """Initialise PortAudio; a `DriverError` where it is busy with a stream that did not close: it serves one thread."""
     if LEFT_BEHIND:
         raise DriverError(f"{name}: initialise: PortAudio has not closed {LEFT_BEHIND[0].name}: {ADVICE}")
@@ -196,15 +170,12 @@ def _quiet() -> Iterator[None]:
 def cards() -> list[Card]:
     """Sound cards that are there now; a `DeviceNotFound` where PortAudio is not."""
     with initialised() as portaudio:
-        infos = [
-            portaudio.Pa_GetDeviceInfo(index).contents
-            for index in range(check(portaudio.Pa_GetDeviceCount(), "audio: list"))
-        ]
+        infos = map(portaudio.Pa_GetDeviceInfo, range(check(portaudio.Pa_GetDeviceCount(), "audio: list")))
         return [
             Card(
                 index=index,
-                name=info.name.decode(errors="replace"),
-                host=portaudio.Pa_GetHostApiInfo(info.hostApi).contents.name.decode(errors="replace"),
+                name=_text(info.name),
+                host=_text(portaudio.Pa_GetHostApiInfo(info.hostApi).name),
                 inputs=info.maxInputChannels,
                 outputs=info.maxOutputChannels,
                 rate=info.defaultSampleRate,
@@ -262,17 +233,19 @@ class Stream:
         memory: Any,
     ) -> None:
         self.name, self._library, self._memory = name, _initialise(name), memory
-        self._handle: c_void_p | None = c_void_p()
+        null, opened = FFI.NULL, FFI.new("void **")
         sides = [
-            None if side is None else byref(StreamParameters(side[0], side[1], FLOAT32, side[2], None))
+            FFI.new("PaStreamParameters *", (side[0], side[1], FLOAT32, side[2], null)) if side else null
             for side in (inputs, output)
         ]
-        arguments = (*sides, rate, frames, 0, callback, user_data)
+        addresses = (FFI.cast("void *", address) for address in (callback, user_data))
+        arguments = (*sides, rate, frames, 0, *addresses)
         try:
-            check(self._library.Pa_OpenStream(byref(self._handle), *arguments), f"{name}: open at {rate:g} Hz")
+            check(self._library.Pa_OpenStream(opened, *arguments), f"{name}: open at {rate:g} Hz")
         except DriverError:
             self._library.Pa_Terminate()
             raise
+        self._handle: Any = opened[0]
 
     def start(self) -> None:
         """Start to call back."""
@@ -308,7 +281,7 @@ class Stream:
         if errors:
             raise errors[0]
 
-    def _release(self, handle: c_void_p, errors: list[DriverError]) -> None:
+    def _release(self, handle: Any, errors: list[DriverError]) -> None:
         try:
             if self._library.Pa_IsStreamActive(handle) == 1:
                 check(self._library.Pa_StopStream(handle), f"{self.name}: stop")

@@ -25,7 +25,7 @@ from hapticrender.protocols import Array, Controller, DeviceLoop, Flag, Renderin
 
 LIST_TIMEOUT = 0.3  # s that a board has to answer where boards are listed
 HOST_BLOCK = 100  # samples of drive from the host
-TELEMETRY = 0.05  # s between two frames of telemetry in live play
+TELEMETRY = 0.05  # s between two frames of telemetry
 JUDGED = 0.25  # s of signal that the figures of a texture are of
 LONGEST_MEAN = 1000.0  # s, of a board; a mean over a shorter time has the larger peaks, and so stops no later
 
@@ -52,7 +52,8 @@ class SerialDriver(BaseDriver):
 
     def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
         self.client = BoardClient(port, **options)
-        self.finger, self._sent, self._begun, self._last = finger, 0, False, np.full(1, np.nan)
+        self.finger, self._begun, self._last = finger, False, np.full(1, np.nan)
+        self._started = math.inf  # s, of the client's clock
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:
             found = self.capabilities = client.capabilities
@@ -99,14 +100,16 @@ class SerialDriver(BaseDriver):
             raise DriverError(
                 f"{self}: device_loop: method {inner.method!r} of this scene cannot run on a board: must be 'inverse'"
             )
-        bands, texture = playable(rendering, self.capabilities)
-        if texture is not None and inner.n_bands and not self.capabilities.friction:
+        loop = BoardLoop(rendering, self)
+        if loop.texture is not None and inner.n_bands and not self.capabilities.friction:
             raise ValueError(f"texture: carriers = {inner.n_bands}: must be left out on a board, which plays it whole")
 
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
-                self.protect(rendering)
-                self._begin(bands, texture)
+                self._begun = True
+                self._point()
+                loop.start()
+                self._started = self.client.clock.monotonic()
             found = self.signals(self.client.rows(count, self._point))
             target = self._targets(rendering, found["position"])
             names = ("sensed", "position", "normal_load", "flags")
@@ -140,14 +143,6 @@ class SerialDriver(BaseDriver):
             rms, time = math.sqrt(2.0) * limits.rms_drive, limits.rms_time  # the board's is that of the carrier's peak
         self.client.limits(peak, min(rms, peak), min(time, LONGEST_MEAN), model.sensed_bound)
 
-    def _begin(self, bands: Bands, texture: BoardTexture | None) -> None:
-        self._begun, client = True, self.client
-        client.set_bands(bands, texture)
-        self._started = client.clock.monotonic()
-        self._point()
-        client.start(stream=1)
-        self._started = client.clock.monotonic()
-
     def _point(self) -> None:
         if self.finger is None:
             return
@@ -175,10 +170,8 @@ class SerialDriver(BaseDriver):
         if not self._begun:
             self._begun = True
             client.begin_queue()
-            client.queue(0, np.zeros_like(drive))
-            self._sent = len(drive)
-        client.queue(self._sent, drive)
-        self._sent += len(drive)
+            client.queue(np.zeros_like(drive))
+        client.queue(drive)
         found = self.signals(client.rows(self.block))
         return Sensed(found["sensed"], flags=found["flags"])
 
@@ -206,15 +199,14 @@ class BoardLoop:
         self.motion_source = "sensors" if driver.sensed_channels else "unknown"
         self._client = client = driver.client
         self.finger, self.watch, self.alive, self.silence = client.finger, client.watch, client.beat, client.stop
-        self._bands, self._texture = self.made(rendering)
+        self._bands, self.texture = self.made(rendering)
         self._recent = np.zeros((0, 3))  # reference, motion and position, m
         self._reconnections = 0  # that have been noted
-        self._fault: HapticError | None = None
 
     def start(self) -> None:
         """Set the bands and play; the port is open."""
         self.driver.protect(self.rendering)
-        self._client.set_bands(self._bands, self._texture)
+        self._client.set_bands(self._bands, self.texture)
         self._client.start(stream=1, telemetry=TELEMETRY)
         self._reconnections = self._client.reconnections
 
@@ -225,16 +217,17 @@ class BoardLoop:
     def replace(self, rendering: Rendering, bands: Bands, texture: BoardTexture | None) -> None:
         """Change to what was `made` of another rendering of the device: within 20 ms from bands to bands, else 40."""
         self._client.set_bands(bands, texture)
-        self.rendering, self._bands, self._texture = rendering, bands, texture
+        self.rendering, self._bands, self.texture = rendering, bands, texture
 
     def set_gain(self, gain: float) -> None:
         """Set the factor on the texture, 0 to 1."""
         self._client.gain = gain
 
-    def fill(self) -> None:
-        """Check the telemetry; a `DriverError` where board or line are gone.
+    def fault(self) -> HapticError | None:
+        """Check the telemetry; return why the board stopped the drive, if it did.
 
-        A board that was lost and found again plays a new run, whose carriers begin anew; what was lost is not counted.
+        A `DriverError` where board or line are gone.  A board that was lost and found again plays a new run, whose
+        carriers begin anew; what was lost is not counted.
         """
         if self._client.reconnections != self._reconnections:
             self._reconnections = self._client.reconnections
@@ -242,8 +235,9 @@ class BoardLoop:
         try:
             self.flags |= self._client.telemetry().flags
         except (DeviceFault, WatchdogTimeout) as fault:
-            self._fault = fault
             self.flags |= Flag.STOPPED
+            return fault
+        return None
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""
@@ -261,7 +255,7 @@ class BoardLoop:
 
         Of a texture that is no sum of bands the amplitudes are rms, over the last quarter of a second.
         """
-        if self._texture is not None and len(self._recent):
+        if self.texture is not None and len(self._recent):
             reference, motion, _ = (self._recent - self._recent.mean(axis=0)).T
             target, achieved, off = (float(np.sqrt(np.mean(x**2))) for x in (reference, motion, motion - reference))
             return [(0.0, target, achieved, off / target if target > 0.0 else math.nan)]
@@ -272,10 +266,6 @@ class BoardLoop:
             size, error = moves * abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, moves * abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows
-
-    def fault(self) -> HapticError | None:
-        """Return why the board stopped the drive, if it did."""
-        return self._fault
 
 
 def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:

@@ -105,7 +105,7 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     name = f"{driver}: latency"
     if len(trips) < runs:
         raise DriverError(f"{name}: samples were lost in {tries - len(trips)} of {tries} runs: use larger blocks")
-    found = Latency(tuple(trips), float(opened.rate), int(opened.block), int(getattr(opened, "queued", 0)))
+    found = Latency(tuple(trips), float(opened.rate), int(opened.block), int(getattr(opened, "host_delay", 0)))
     weakest = min(trip.correlation for trip in trips)
     if weakest < LEAST_CORRELATION:
         raise DriverError(
@@ -126,7 +126,7 @@ def _trip(driver: Any, amplitude: float, rng: np.random.Generator) -> Trip | Non
     block = driver.block
     length = -(-max(round(BURST * driver.rate), FEWEST) // block) * block
     burst = amplitude * rng.choice([-1.0, 1.0], length)
-    tail = round(TAIL * driver.rate) + getattr(driver, "queued", 0)
+    tail = round(TAIL * driver.rate) + getattr(driver, "host_delay", 0)
     played = np.concatenate([burst, np.zeros(-(-tail // block) * block)])
     sensed, lost = np.empty_like(played), np.zeros(len(played), bool)
     for start in range(0, len(played), block):

@@ -125,8 +125,7 @@ class Player(Addressed):
         self._recorder: Recorder | None = None
         self._unwritten: OSError | None = None  # that has ended the recording, such as a full disk
         self._calls, self._watched = 0, math.inf  # of the application under way; s: the watchdog's time at the moment
-        self._entered, self._clocked = False, False  # whether the device has a clock of its own: it is not played
-        self._recorded = 0  # samples of this loop that were looked at
+        self._entered, self._recorded = False, 0  # samples of this loop that were looked at
         self._stack, self._threads, self._lock = ExitStack(), LiveThreads(), threading.RLock()
         self._stopping, self._timeout = self._threads.stopping, TIMEOUT  # s; and two blocks of the driver
         self._changing = threading.RLock()  # of the texture; taken before `_lock`
@@ -361,12 +360,11 @@ class Player(Addressed):
         device: Any = rendering.device
         stack, calls_back = self._stack, is_called_back(rendering)
         own = rendering.driver is device and hasattr(device, "loop")
-        self._clocked = calls_back or own
         blocks = 2 * rendering.driver.block / rendering.driver.rate
         self._timeout = TIMEOUT + blocks
         if self._watchdog is not None and self._watchdog < blocks:
             raise ValueError(f"watchdog = {self._watchdog:g} s: must be >= {blocks:g} s, two blocks of the driver")
-        if self._clocked and not self._paced:
+        if (calls_back or own) and not self._paced:
             raise ValueError("paced = False: must be True on a device with a clock of its own")
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
@@ -452,8 +450,6 @@ class Player(Addressed):
     def _service(self) -> None:
         """Record what was, see whether the device or the application has stopped."""
         loop = self._loop
-        if not isinstance(loop, LiveLoop):
-            loop.fill()  # says whether a board is there
         if hasattr(loop.rendering.device, "check"):
             loop.rendering.device.check()  # one that calls back cannot say that it is gone
         fault = loop.fault()  # before the signals are read, so that all of what led to it is recorded

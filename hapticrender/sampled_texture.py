@@ -164,23 +164,21 @@ class EvaluatedTexture(Addressed):
     """
 
     def __init__(self, rendering: Rendering, ahead: int, places: Array, position: Array) -> None:
-        self._prepare(rendering, ahead + len(position))
         self._places, self._position, steps = places, position, np.arange(len(position))
         self._later = np.concatenate([steps, ahead + steps])
         self.error: BaseException | None = None
         self._read = READER(self._evaluate)
         address = ctypes.cast(self._read, ctypes.c_void_p).value
-        self._describe(evaluate=address, written=FOREVER)
+        self._describe(rendering, ahead + len(position), evaluate=address, written=FOREVER)
 
-    def _prepare(self, rendering: Rendering, length: int) -> None:
+    def _describe(self, rendering: Rendering, length: int, **values: Any) -> None:
+        """Make the record, with a ring of `length` samples that are 0."""
         bands, name = rendering.bands, type(rendering.scene.texture).__name__
         self._waveform = evaluated(name, bands, rendering.waveform)
         self._rate, self._follows, self._samples = rendering.driver.rate, bands.follows_finger, np.zeros(length)
         self.control: Any = None  # keeps the controller that plays it alive
-
-    def _describe(self, **values: Any) -> None:
         self.record = record_of(
-            TEXTURE, samples_at=self._samples, length=len(self._samples), back=-FOREVER, follows=self._follows, **values
+            TEXTURE, samples_at=self._samples, length=length, back=-FOREVER, follows=self._follows, **values
         )
         self.address = int(self.record.ctypes.data)
 
@@ -212,12 +210,11 @@ class ForeseenTexture(EvaluatedTexture):
 
     def __init__(self, rendering: Rendering, ahead: int, path: Array) -> None:
         self._ahead, count = ahead, path.shape[1] - ahead
-        self._prepare(rendering, 2 * (ahead + count))
         self._pieces, self._back = np.zeros((SLOTS, 1 + count)), 0
-        self._samples[:count] = self._values(np.arange(count), *path[:, :count])
         buffer = {"pieces_at": self._pieces, "width": 1 + count, "middle": 1, "slot": 2}
-        rate = self._rate
-        self._describe(written=count, fade=FADE * rate, blend=BLEND * rate, **buffer)
+        fades = {"fade": FADE * rendering.driver.rate, "blend": BLEND * rendering.driver.rate}
+        self._describe(rendering, 2 * (ahead + count), written=count, **fades, **buffer)
+        self._samples[:count] = self._values(np.arange(count), *path[:, :count])
 
     def foresee(self, sample: int, path: Array) -> None:
         """Evaluate it again for a path that begins at `sample` of the device's clock."""

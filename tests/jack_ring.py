@@ -213,13 +213,15 @@ def entry_for(live):
     return entry
 
 
-def relative_errors(device, path, last, samples, seconds=2.0, before=0.1):
+def relative_errors(device, path, entry, seconds=2.0, before=0.1):
     """Motion of centre and ends over the target, less 1, complex of shape (3, 8), `before` (s) the end of the record.
 
-    `last` is the last block that the entry sensed, after which it had played `samples`; it is found in what the device
-    has recorded with its noise, and so are the entry's own numbers of the device's samples.
+    The last block that the entry sensed is found in what the device has recorded with its noise, and so are the entry's
+    own numbers of the device's samples.
     """
     true, noisy = device.recorded(path)
+    samples = entry.samples
+    last = (entry.log(samples - BLOCK)["sensed"] / METRES).astype(np.float32)
     (place,) = (n for n in np.flatnonzero(noisy[: -BLOCK + 1, 0] == last[0, 0]) if (noisy[n : n + BLOCK] == last).all())
     index = np.arange(round(seconds * RATE)) + place - round((before + seconds) * RATE)
     phase = 2 * np.pi * np.outer(index - place + samples - BLOCK, FREQUENCY) / RATE + comb().phase

@@ -159,7 +159,7 @@ def test_the_limits_of_a_device_are_held_live_on_a_board(fast):
     loop = driver.loop(hr.prepare(replace(PRESSED, limits=limits), driver=driver))
     with driver:
         loop.start()
-        peak, *others = driver.client._setup.limits
+        peak, *others = driver.client._settings[Kind.LIMITS]
     assert 0.5 - 3.0 / 2**11 < peak <= 0.5
     assert others == [0.25, 1e3, 4e-4]
 
