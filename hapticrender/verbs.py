@@ -58,15 +58,15 @@ def demo(arguments: argparse.Namespace) -> int:
     scenes = builtin_scenes(carriers=None if arguments.method in (None, "inverse") else 6)
     _check_run_folders([arguments.out / name for name in scenes], arguments)
     renderings = _prepare(scenes, arguments)
-    finished: list[outputs.Outputs] = []
+    finished: dict[Path, dict[str, Any]] = {}
     try:
         for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
             with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
-                finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
+                finished[arguments.out / name] = outputs.run_into(arguments.out / name, rendering, progress=tick)
     finally:
         if finished:
             page = write_page(arguments.out, finished)
-    print(printable(table(overview([scene.summary for scene in finished]))))
+    print(printable(table(overview(list(finished.values())))))
     print(f"page: {page}")
     return 0
 
@@ -84,7 +84,7 @@ def render(arguments: argparse.Namespace) -> int:
         driver = _driver(arguments.driver, scene, arguments.force)
     [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
     with progress(f"1/1 {arguments.scene}", sys.stderr) as tick, naming_driver(arguments.driver):
-        summary = outputs.run_into(arguments.out, rendering, progress=tick).summary
+        summary = outputs.run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
         _print_figures(summary)
         notes = "\n".join(filter(None, [getattr(rendering.controller(), "note", ""), notes]))
@@ -125,8 +125,8 @@ def play(arguments: argparse.Namespace) -> int:
                     second = int(player.time) + 1
     finally:
         if journal is not None and journal.exists():
-            made = outputs.write_outputs(out / scene.name, _recording(journal))
-            print(f"page: {write_page(out, [made])}")
+            made = outputs.write_outputs(journal.parent, _recording(journal))
+            print(f"page: {write_page(out, {journal.parent: made})}")
     return 0
 
 
