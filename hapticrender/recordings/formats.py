@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
-from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
+from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, refuse_open, write_journal
 
 Arrays = dict[str, tuple[float, Callable[[], Any]]]  # of a file, by name: bytes (NaN: not here), and what reads it
 
@@ -104,7 +104,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def _values(header: Header, frames: Any) -> dict[str, Any]:
     """All signals by name, with header, time and rate."""
-    signals = split(header, frames[:])
+    rows = frames[:]
+    signals = {name: column(header, rows, name) for name in header.slices}
     return {"header": header.to_json(), "rate": header.rate, "time": np.arange(len(frames)) / header.rate, **signals}
 
 

@@ -156,7 +156,7 @@ def write_outputs(folder: Path, recording: Recording) -> dict[str, Any]:
     """
     header, sound = recording.header, {}
     for name, unit in (("drive", header.drive_unit), ("sensed", header.unit)):
-        if header.widths[name]:
+        if header.columns[name]:
             full_scale = write_sound(folder / f"{name}.wav", recording.read(name), header.rate, unit)
             sound[f"{name}.wav"] = {"full_scale": full_scale, "unit": unit}
     with suppress(MissingExtra):
