@@ -237,13 +237,15 @@ def _read_csv(path: Path) -> tuple[Header, Array]:
     return header, numbers[:, 1:]
 
 
+CONTAINERS: dict[str, tuple[Callable[[Path], Any], str]] = {  # what reads their arrays, and what they are
+    ".mat": (mat_arrays, "a MAT file"),
+    **dict.fromkeys((".h5", ".hdf5"), (h5_arrays, "an HDF5 file")),
+    ".npz": (npz_arrays, "an NPZ file of arrays"),
+}
 READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
     ".au": read_journal,
-    ".npz": _reader(npz_arrays),
-    ".h5": _reader(h5_arrays),
-    ".hdf5": _reader(h5_arrays),
-    ".mat": _reader(mat_arrays),
     ".csv": _read_csv,
+    **{suffix: _reader(arrays) for suffix, (arrays, _) in CONTAINERS.items()},
 }
 WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".au": write_journal,
