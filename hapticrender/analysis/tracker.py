@@ -142,7 +142,7 @@ class FingerTracker:
         self._at += len(drive)
         force = signals.residual(self.course.at(time), self.course.plate.half_spacing)
         measured = np.concatenate([force, signals.displacement], axis=1)
-        rest = None if self._given is None else self._given.at(time)
+        rest = None if self._given is None else self._given.at(time - self._detector.delay / self.rate)
         high = self._thresholds(signals)
         loaded, rest = self._detector.update(measured, high, rest)
         delayed = self._delayed.before(np.column_stack([measured, high]))[: len(drive)]
