@@ -34,14 +34,6 @@ ENDS = 3.0  # periods of the lowest frequency: so far a kink where a recording i
 Passband = tuple[float, float]
 
 
-def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
-    """Bands whose envelopes are to be analysed: over position, or over time below rate/2."""
-    if speed is None:
-        frequency = frequency[frequency < rate / 2]
-        return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
-    return Bands(frequency=0 * frequency, wavenumber=frequency / speed, phase=0 * frequency)
-
-
 def _peak(values: Array, ends: int = 0) -> float:
     """Peak of what is not constant, but for `ends` samples at each end."""
     return float(np.abs(values[ends : max(values.size - ends, 0)] - values.mean()).max(initial=0.0))
@@ -146,14 +138,18 @@ class Recorded(Validated, Composable):
         self.bands(rate=np.inf)
 
     def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed.
+        """Carriers at the strongest peaks of the spectrum; their envelopes are to be analysed.
 
-        None without `carriers`: the whole waveform is played.
+        Over time they are below rate/2 (`rate` in Hz).  None without `carriers`: the whole waveform is played.
         """
         if self.carriers is None:
             return Bands.none(spatial=self.spatial)
         curve, chosen = self.curve, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
-        return _carriers(strongest_carriers(curve.values, 1 / curve.step, **chosen), self.speed, rate)  # type: ignore[arg-type]
+        frequency = strongest_carriers(curve.values, 1 / curve.step, **chosen)  # type: ignore[arg-type]
+        if self.speed is not None:
+            return Bands(frequency=0 * frequency, wavenumber=frequency / self.speed, phase=0 * frequency)
+        frequency = frequency[frequency < rate / 2]
+        return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
