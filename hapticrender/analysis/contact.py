@@ -56,11 +56,12 @@ class ContactDetector:
         """Variance (N^2) of the heave force at rest: at its end a line is four times as uncertain as a mean."""
         return 4 * self._scatter / max(self._ticks, 1)
 
-    def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array]:
-        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block does.
+    def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array, Array]:
+        """Contact (bool, (n,)), values less those at rest (n, columns) and thresholds (n,), `delay` samples late.
 
-        `measured` (n, columns) has the heave force (N) first, `high` (N, (n,)) is its upper threshold; `rest`
-        (n, columns), of the samples of the result, replaces what would be followed.
+        They are of the n samples that end so long before the block does.  `measured` (n, columns) has the heave force
+        (N) first, `high` (N, (n,)) is its upper threshold; `rest` (n, columns), of the samples of the result, replaces
+        what would be followed.
         """
         n = len(measured)
         joined, high = self._measured.before(measured), self._high.before(high)
@@ -82,7 +83,7 @@ class ContactDetector:
             self._follow(joined[now], loaded[now], self._at + now.stop)
             first = now.stop
         self._at += n
-        return loaded, level
+        return loaded, joined[:n] - level, high[:n]
 
     def _decide(self, force: Array, ahead: Array, high: Array, first: int) -> Array:
         """Contact of a part of a tick: the last of the events on and off."""
