@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from hapticrender.accuracy.signals import Modulated, Path, chirp, clicks, pink, sliding, white
+from hapticrender.accuracy.signals import Path, chirp, clicks, modulated, pink, sliding, white
 from hapticrender.control.methods import method_named
 from hapticrender.errors import PlateMismatch
 from hapticrender.loop import render
@@ -335,7 +335,7 @@ def modulation(bench: Bench) -> dict[str, float]:
     """30 % AM of 50 um at 5 Hz, played as a whole: rms error of the centre's amplitude, worst of four frequencies."""
     worst = 0.0
     for frequency in (47.0, 111.0, 178.0, 261.0):
-        run = bench.play(Modulated(frequency, AMPLITUDE), 6.0)
+        run = bench.play(modulated(frequency, AMPLITUDE), 6.0)
         time, found = run.tone(frequency, [CENTRE])
         target = run._replace(truth=run.reference[:, None]).tone(frequency, [0])[1]
         worst = max(worst, float(amplitude_error(found[time > 2.0, 0], target[time > 2.0, 0], axis=0)))
