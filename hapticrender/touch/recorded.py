@@ -31,8 +31,6 @@ FELT = (20.0, 1000.0)  # Hz: what is played by default, up to where vibration is
 CARRIED = (20.0, 400.0)  # where carriers are chosen
 ENDS = 3.0  # periods of the lowest frequency: so far a kink where a recording is reflected reaches (a sine's: 0.3 %)
 
-Passband = tuple[float, float]
-
 
 def _peak(values: Array, ends: int = 0) -> float:
     """Peak of what is not constant, but for `ends` samples at each end."""
@@ -83,7 +81,7 @@ class Recorded(Validated, Composable):
     gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
     carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
     spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
+    passband: tuple[float, float] | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
