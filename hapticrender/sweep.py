@@ -33,8 +33,9 @@ def sweep(
 
     `judge` takes a `Recording` and returns what is kept of it, by default its summary; for an executor of other
     processes it is a function of a module.  `method` is the name of a control method, by default that of each scene;
-    `executor` is by default this thread; one of processes sends them `at_a_time` (>= 1) scenes at once (`chunksize` of
-    its `map`, which others ignore).  A `SweepError` where a scene fails; tasks that have not begun are cancelled.
+    `executor` is by default this thread; one that has processes hands `at_a_time` (>= 1) scenes at once to each of them
+    (`chunksize` of its `map`, which others ignore).  A `SweepError` where a scene fails; tasks that have not begun are
+    cancelled.
 
     Examples
     --------
