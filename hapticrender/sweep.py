@@ -6,7 +6,6 @@
 from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from functools import partial
-from itertools import chain
 from typing import Any
 
 from hapticrender import checks
@@ -15,7 +14,7 @@ from hapticrender.loop import render
 from hapticrender.recordings.recording import Recording
 from hapticrender.touch.scene import Scene
 
-AT_A_TIME = 16  # scenes a task: enough to be worth sending
+AT_A_TIME = 16  # scenes sent to a process at once: enough to be worth it
 
 
 class SweepError(HapticError):
@@ -34,8 +33,9 @@ def sweep(
 
     `judge` takes a `Recording` and returns what is kept of it, by default its summary; for an executor of other
     processes it is a function of a module.  `method` is the name of a control method, by default that of each scene;
-    `executor` is by default this thread, and gets `at_a_time` (>= 1) scenes a task.  A `SweepError` where a scene
-    fails; tasks that have not begun are cancelled.
+    `executor` is by default this thread; one that has processes hands `at_a_time` (>= 1) scenes at once to each of them
+    (`chunksize` of its `map`, which others ignore).  A `SweepError` where a scene fails; tasks that have not begun are
+    cancelled.
 
     Examples
     --------
@@ -46,10 +46,9 @@ def sweep(
     """
     at_a_time = checks.integer("at_a_time", at_a_time, "scenes", least=1)
     checks.require(isinstance(scenes, Iterable), "scenes", scenes, "scenes, in a list for example", TypeError)
-    numbered = list(enumerate(scenes))
-    parts = [numbered[start : start + at_a_time] for start in range(0, len(numbered), at_a_time)]
-    found = (map if executor is None else executor.map)(partial(_run, judge=judge, method=method), parts)
-    return list(chain.from_iterable(found))  # where one raises, `Executor.map` cancels the others
+    spread = map if executor is None else partial(executor.map, chunksize=at_a_time)
+    run = partial(_run, judge=judge, method=method)
+    return list(spread(run, list(enumerate(scenes))))  # where one raises, `Executor.map` cancels the others
 
 
 def worst_error(recording: Recording) -> float:
@@ -58,15 +57,13 @@ def worst_error(recording: Recording) -> float:
     return max(errors, default=float("inf"))
 
 
-def _run(part: list[tuple[int, Scene]], judge: Callable[[Recording], Any] | None, method: str | None) -> list[Any]:
-    """Results of a few scenes; raises at the first that fails."""
-    found: list[Any] = []
-    for index, scene in part:
-        try:
-            recording = render(scene, method=method)
-            found.append(recording.summary() if judge is None else judge(recording))
-        except Exception as error:
-            name = getattr(scene, "name", type(scene).__name__)
-            problem = f"scenes[{index}] ({name!r}): {type(error).__name__}: {error}"
-            raise SweepError(problem) from None  # a cause might not be pickled
-    return found
+def _run(numbered: tuple[int, Scene], judge: Callable[[Recording], Any] | None, method: str | None) -> Any:
+    """Result of a scene, by its number."""
+    index, scene = numbered
+    try:
+        recording = render(scene, method=method)
+        return recording.summary() if judge is None else judge(recording)
+    except Exception as error:
+        name = getattr(scene, "name", type(scene).__name__)
+        problem = f"scenes[{index}] ({name!r}): {type(error).__name__}: {error}"
+        raise SweepError(problem) from None  # a cause might not be pickled

@@ -240,7 +240,7 @@ def _summary(rendering: Rendering, folder: Path | None, tick: Tick | None) -> tu
         recording = outputs.run_to_end(place, rendering, tick)
         summary, warned = recording.summary(), recording.warnings
         if folder is not None and not summary["passed"]:
-            return dict(outputs.write_outputs(folder, recording).summary), warned
+            return outputs.write_outputs(folder, recording), warned
         del recording  # closes its journal
         outputs.remove_outputs(place)
     return summary, warned

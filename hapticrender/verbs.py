@@ -58,22 +58,22 @@ def demo(arguments: argparse.Namespace) -> int:
     scenes = builtin_scenes(carriers=None if arguments.method in (None, "inverse") else 6)
     _check_run_folders([arguments.out / name for name in scenes], arguments)
     renderings = _prepare(scenes, arguments)
-    finished: list[outputs.Outputs] = []
+    finished: dict[Path, dict[str, Any]] = {}
     try:
         for number, (name, rendering) in enumerate(zip(scenes, renderings, strict=True), 1):
             with progress(f"{number}/{len(scenes)} {name}", sys.stderr) as tick:
-                finished.append(outputs.run_into(arguments.out / name, rendering, progress=tick))
+                finished[arguments.out / name] = outputs.run_into(arguments.out / name, rendering, progress=tick)
     finally:
         if finished:
             page = write_page(arguments.out, finished)
-    print(printable(table(overview([scene.summary for scene in finished]))))
+    print(printable(table(overview(list(finished.values())))))
     print(f"page: {page}")
     return 0
 
 
 def render(arguments: argparse.Namespace) -> int:
     """Render a scene into a folder."""
-    scene, notes = _scene(arguments.scene), ""
+    scene, notes = validation.open_scene(arguments.scene), ""
     _check_run_folders([arguments.out], arguments, Path(arguments.scene))
     with naming(arguments.scene):
         if arguments.least_model:
@@ -81,10 +81,10 @@ def render(arguments: argparse.Namespace) -> int:
 
             found = least_model(scene)
             scene, notes = found.scene, found.text
-        driver = _driver(arguments.driver, scene, arguments.force)
+        driver = open_driver(arguments.driver, scene.device_profile, arguments.force)
     [rendering] = _prepare({arguments.scene: scene}, arguments, driver)
     with progress(f"1/1 {arguments.scene}", sys.stderr) as tick, naming_driver(arguments.driver):
-        summary = outputs.run_into(arguments.out, rendering, progress=tick).summary
+        summary = outputs.run_into(arguments.out, rendering, progress=tick)
     if arguments.verbose:
         _print_figures(summary)
         notes = "\n".join(filter(None, [getattr(rendering.controller(), "note", ""), notes]))
@@ -98,7 +98,7 @@ def render(arguments: argparse.Namespace) -> int:
 
 def play(arguments: argparse.Namespace) -> int:
     """Play a scene live, with a line for every band: target, achieved and flags."""
-    scene, out = _scene(arguments.scene), arguments.out
+    scene, out = validation.open_scene(arguments.scene), arguments.out
     changes = {name: getattr(arguments, name) for name in ("method", "seed") if getattr(arguments, name) is not None}
     scene = replace(scene, **changes)
     seconds = number("--seconds", scene.duration if arguments.seconds is None else arguments.seconds, "s", above=0.0)
@@ -107,7 +107,7 @@ def play(arguments: argparse.Namespace) -> int:
     journal, above, second = None, 0, 0
     try:
         with naming(arguments.scene):
-            player = Player(scene, _driver(arguments.driver, scene, arguments.force))
+            player = Player(scene, open_driver(arguments.driver, scene.device_profile, arguments.force))
         with outputs.naming_full(out or ""), naming_driver(arguments.driver), player:
             with naming(arguments.scene), naming_driver(arguments.driver, ValueError, TypeError):
                 player.play(scene.texture)
@@ -125,8 +125,8 @@ def play(arguments: argparse.Namespace) -> int:
                     second = int(player.time) + 1
     finally:
         if journal is not None and journal.exists():
-            made = outputs.write_outputs(out / scene.name, _recording(journal))
-            print(f"page: {write_page(out, [made])}")
+            made = outputs.write_outputs(journal.parent, _recording(journal))
+            print(f"page: {write_page(out, {journal.parent: made})}")
     return 0
 
 
@@ -220,7 +220,7 @@ def identify(arguments: argparse.Namespace) -> int:
     from hapticrender.process_signals import stopped_by_signal
     from hapticrender.touch.finger import Finger
 
-    scene = _scene(arguments.scene or "grating-20")  # any on the paper's plate
+    scene = validation.open_scene(arguments.scene or "grating-20")  # any on the paper's plate
     if arguments.out:
         outputs.check_file("--out", arguments.out)
         scene = _kept(arguments.out, scene)
@@ -231,7 +231,7 @@ def identify(arguments: argparse.Namespace) -> int:
         require(known, "device.kind", scene.device, "vt-plate, ultrasonic or electroadhesion")
         setup = registered("renderers", scene.device)().read(scene, None)
         seed = scene.seed if arguments.seed is None else arguments.seed
-        driver = _driver(arguments.driver, scene)
+        driver = open_driver(arguments.driver, scene.device_profile)
         plants: dict[str, Callable[[], Any]] = {
             "vt-plate": lambda: Plate(setup.simulated, Finger.absent(), seed),
             "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
@@ -319,7 +319,7 @@ def latency(arguments: argparse.Namespace) -> int:
 def export(arguments: argparse.Namespace) -> int:
     """Write a scene's controller as C sources."""
     outputs.check_folder("--out", arguments.out)
-    scene = _scene(arguments.scene)
+    scene = validation.open_scene(arguments.scene)
     with naming(arguments.scene):
         written = export_design(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
     folder = shlex.quote(str(arguments.out))
@@ -358,11 +358,6 @@ def _recording(path: Path) -> Recording:
         return Recording.load(path)
 
 
-def _scene(reference: str) -> Scene:
-    with naming(reference):
-        return validation.open_scene(reference)
-
-
 def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: Any = None) -> list[Rendering]:
     """Design everything that will run, which refuses what a device cannot do; state before it runs what is missing."""
     renderings = []
@@ -372,8 +367,3 @@ def _prepare(scenes: dict[str, Scene], arguments: argparse.Namespace, driver: An
     if find_spec("matplotlib") is None:
         print(PICTURES_HINT, file=sys.stderr)
     return renderings
-
-
-def _driver(text: str, scene: Scene, overwrite: bool = False) -> Any:
-    """Make the driver of ``--driver``, calibrated as the scene states; None for the simulated device."""
-    return open_driver(text, scene.device_profile, overwrite)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from synthetic import make_bands, make_recording
 
-from hapticrender.report.outputs import FILES, Outputs, refuse_other_page, refuse_to_overwrite
-from hapticrender.report.page import page, write_page
+from hapticrender.report.outputs import FILES, refuse_other_page, refuse_to_overwrite
+from hapticrender.report.page import write_page
 
 VOID = {"meta", "img", "br"}
 SOUND = {"drive.wav": {"full_scale": 2.0, "unit": "A"}, "sensed.wav": {"full_scale": 2e-5, "unit": "m"}}
@@ -39,19 +39,20 @@ class Reader(HTMLParser):
 
 
 def outputs(folder, gain=1.0, name="grating", notes=(), toml='name = "grating"\n', bands=None, **scene):
-    """A folder about a motion that is `gain` times its target."""
+    """Summary, by the folder of its scene, of a motion that is `gain` times its target."""
     bands = bands or make_bands(170.0, 1e-5)
     summary = make_recording(bands, np.array(gain) * bands.envelope, scene={"name": name, **scene}).summary()
     summary |= {"sound": SOUND, "notes": list(notes)}
-    return Outputs(name=name, folder=folder / name, summary=summary, toml=toml)
+    (folder / name).mkdir()
+    (folder / name / "scene.toml").write_text(toml, encoding="utf-8")
+    return {folder / name: summary}
 
 
 def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
-    scenes = [outputs(tmp_path, 1.0, "good one"), outputs(tmp_path, [[5.0], [1.0], [1.0]], "bad")]
-    for scene in scenes:
-        scene.folder.mkdir()
+    scenes = outputs(tmp_path, 1.0, "good one") | outputs(tmp_path, [[5.0], [1.0], [1.0]], "bad")
+    for folder in scenes:
         for name in set(FILES) - {"recording.au"}:  # read where devices share a texture
-            (scene.folder / name).touch()
+            (folder / name).touch()
     path = write_page(tmp_path, scenes)
     report = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)
     assert [scene["scene"] for scene in report["scenes"]] == ["good one", "bad"]
@@ -70,7 +71,7 @@ def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
 
 
 def test_only_a_page_of_ours_is_replaced(tmp_path):
-    write_page(tmp_path, [])
+    write_page(tmp_path, {})
     refuse_other_page(tmp_path)
     refuse_to_overwrite(tmp_path)  # with a scene's files: a page and `summary.json` are all there is
     (tmp_path / "index.html").write_text("<p>mine</p>")
@@ -82,7 +83,8 @@ def test_only_a_page_of_ours_is_replaced(tmp_path):
 
 def test_nothing_in_a_scene_becomes_markup(tmp_path):
     nasty = '<script>alert("1")</script> & more'
-    read = Reader(page(tmp_path, [outputs(tmp_path, name="a&b", notes=[nasty], toml=f"# {nasty}")]))
+    path = write_page(tmp_path, outputs(tmp_path, name="a&b", notes=[nasty], toml=f"# {nasty}"))
+    read = Reader(path.read_text(encoding="utf-8"))
     assert "script" not in read.tags
     assert read.text.count(nasty) == 2
     assert "matplotlib is not installed" in read.text

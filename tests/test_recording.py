@@ -379,7 +379,7 @@ def test_files_that_would_grow_in_memory_or_do_not_fit_their_header_are_refused(
     from scipy.io import savemat
 
     savemat(tmp_path / "bomb.mat", {"header": header, "drive": np.zeros((1_000_000, 2))}, do_compression=True)
-    signals = journal.split(recording.header, recording.frames) | {"header": np.array(header)}
+    signals = {name: recording.read(name) for name in recording.header.slices} | {"header": np.array(header)}
     np.savez(tmp_path / "shape.npz", **signals | {"motion": np.zeros((5, 3))})
     for name, message in (
         ("bomb.npz", "drive has .* bytes, the file"),

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from hapticrender.accuracy.signals import Modulated, Path, chirp, clicks, pink, sliding, white
+from hapticrender.accuracy.signals import Path, chirp, clicks, modulated, pink, sliding, white
 from hapticrender.control.methods import method_named
 from hapticrender.errors import PlateMismatch
 from hapticrender.loop import render
@@ -76,7 +76,7 @@ class Run(NamedTuple):
 
     def tone(self, frequency: float, columns: Sequence[int], hop: float = 0.0) -> tuple[Array, Array]:
         """Middle times (s) and envelopes (m, (windows, columns)) of a tone; windows `hop` (s) apart, or half of one."""
-        size, turns = round(window(frequency) / self.time[1]), np.mod(frequency * self.time, 1.0)
+        size, turns = round(max(0.02, 2 / frequency) / self.time[1]), np.mod(frequency * self.time, 1.0)
         hops = round(hop / self.time[1]) or size // 2
         time, found = self.envelopes(2 * np.pi * turns[:, None], columns, size, hops)
         return time, found[:, :, 0]
@@ -190,11 +190,6 @@ def touching(mechanics: FingerMechanics, load: float) -> Finger:
     """Finger that touches at 0.1 s, presses `load` (N) 1 ms later, its impedance growing with it, and slides."""
     whole = replace(mechanics, reference_load=load)
     return Finger(Path(sliding), ((0.1, 0.101), (0.0, load)), ((0.1, 1000.0),), whole, load_scaling=True)
-
-
-def window(frequency: float) -> float:
-    """Length (s) of a window for a carrier of `frequency` (Hz)."""
-    return max(0.02, 2 / frequency)
 
 
 def rms(values: Array, axis: int | tuple[int, ...] = 0) -> Array:
@@ -340,7 +335,7 @@ def modulation(bench: Bench) -> dict[str, float]:
     """30 % AM of 50 um at 5 Hz, played as a whole: rms error of the centre's amplitude, worst of four frequencies."""
     worst = 0.0
     for frequency in (47.0, 111.0, 178.0, 261.0):
-        run = bench.play(Modulated(frequency, AMPLITUDE), 6.0)
+        run = bench.play(modulated(frequency, AMPLITUDE), 6.0)
         time, found = run.tone(frequency, [CENTRE])
         target = run._replace(truth=run.reference[:, None]).tone(frequency, [0])[1]
         worst = max(worst, float(amplitude_error(found[time > 2.0, 0], target[time > 2.0, 0], axis=0)))

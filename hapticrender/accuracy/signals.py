@@ -5,18 +5,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticrender.bands import Bands
 from hapticrender.protocols import Array
-from hapticrender.touch.composed import Chirp
+from hapticrender.touch.composed import Chirp, Playlist
+from hapticrender.touch.grating import Grating
 from hapticrender.touch.recorded import Recorded
 
 FINE, RMS = 20e3, 5e-6  # Hz, m: of the samples
 
 
-def recorded(values: Array, low: float = 20.0, high: float = 500.0, exponent: float = 0.0) -> Recorded:
-    """Samples without energy outside low to high (Hz), of a power spectrum f^exponent times theirs, as a texture."""
+def recorded(values: Array, high: float = 500.0, exponent: float = 0.0) -> Recorded:
+    """Samples without energy outside 20 to `high` (Hz), of a power spectrum f^exponent times theirs, as a texture."""
     frequency, spectrum = np.fft.rfftfreq(len(values), 1 / FINE), np.fft.rfft(values)
-    inside = (frequency >= low) & (frequency <= high)
+    inside = (frequency >= 20.0) & (frequency <= high)
     spectrum[inside] *= frequency[inside] ** (exponent / 2)
     values = np.fft.irfft(np.where(inside, spectrum, 0.0), len(values))
     return Recorded(samples=tuple(values), rate=FINE, gain=RMS / float(np.sqrt(np.mean(values**2))))
@@ -45,20 +45,10 @@ def chirp(_: int) -> Chirp:
     return Chirp(start=20.0, stop=480.0, duration=3.0, amplitude=RMS * 2**0.5)
 
 
-class Modulated(NamedTuple):
-    """A tone (Hz, m) with 30 % AM at 5 Hz."""
-
-    frequency: float
-    amplitude: float
-
-    def bands(self, rate: float) -> Bands:
-        """No carriers: all of it is played."""
-        return Bands.none(spatial=False)
-
-    def waveform(self, time: Array, position: Array) -> Array:
-        """Target displacement (m)."""
-        modulated = self.amplitude * (1 + 0.3 * np.cos(2 * np.pi * 5.0 * time))
-        return np.asarray(modulated * np.cos(2 * np.pi * self.frequency * time))
+def modulated(frequency: float, amplitude: float) -> Playlist:
+    """A tone (Hz, m) with 30 % AM at 5 Hz; as a playlist it has no carriers, and all of it is played."""
+    partials = (1.0, 1.0, 0.0), (1.0 - 5.0 / frequency, 0.15, 0.0), (1.0 + 5.0 / frequency, 0.15, 0.0)
+    return Playlist(((Grating(frequency=frequency, amplitude=amplitude, partials=partials), 60.0),), fade=0.0)
 
 
 class Path(NamedTuple):

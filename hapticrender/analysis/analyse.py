@@ -223,16 +223,6 @@ class _Signals:
         return replace(found, value=value, standard_error=errors)
 
 
-def _implausible(touch: Touch, impedance: Impedance, seconds: float) -> str:
-    """Describe touches that are no finger's; empty where all may be."""
-    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
-    sizes = np.abs(impedance.value[np.isfinite(impedance.value)])
-    size = np.median(sizes) if sizes.size else 0.0
-    if heaviest <= HEAVIEST and touches <= MOST_TOUCHES * max(seconds, 1.0) and size <= STIFFEST:
-        return ""
-    return f"up to {heaviest:.3g} N in {touches:.0f} touches, |Z| {size:.3g} N s/m"
-
-
 def _notes(
     recording: Recording, course: Course, touch: Touch, rest: Rest | None, impedance: Impedance, threshold: float
 ) -> Iterator[str]:
@@ -263,8 +253,13 @@ def _notes(
     ):
         if flags & bad:
             yield f"{text}: errors near there are larger than stated"
-    if implausible := _implausible(touch, impedance, len(recording) / recording.rate):
-        yield f"{implausible}: check units, signs and scales of drive and sensors, the block, and the profile"
+    heaviest, touches = np.nanmax(touch.normal_load.value, initial=0.0), np.diff(touch.contact == LOADED).sum() / 2
+    sizes = np.abs(impedance.value[np.isfinite(impedance.value)])
+    size = np.median(sizes) if sizes.size else 0.0
+    most = MOST_TOUCHES * max(len(recording) / recording.rate, 1.0)
+    if heaviest > HEAVIEST or touches > most or size > STIFFEST:  # no finger's
+        found = f"up to {heaviest:.3g} N in {touches:.0f} touches, |Z| {size:.3g} N s/m"
+        yield f"{found}: check units, signs and scales of drive and sensors, the block, and the profile"
     plate, known = course.plate, recording.header.delay
     if known is not None and plate.delay != known:
         yield f"the profile's delay, {plate.delay} samples, is not that of the recording, {known} samples"

@@ -43,7 +43,7 @@ class ContactDetector:
     def __init__(self, rate: float, quiet: int, still: float, columns: int = 1) -> None:
         self.rate, self.delay = rate, round(HOLD * rate)
         self._tick = max(round(TICK * rate), 1)
-        self._measured, self._high, self._given = (History(self.delay) for _ in range(3))
+        self._measured, self._high = History(self.delay), History(self.delay)
         self._at = -self.delay  # sample of the next result
         self._quiet, self._still, self._loaded = quiet, still, False
         self._rest, self._trend, self._ticks = np.zeros(columns), np.zeros(columns), 0  # trend: a tick; ticks fitted
@@ -56,22 +56,22 @@ class ContactDetector:
         """Variance (N^2) of the heave force at rest: at its end a line is four times as uncertain as a mean."""
         return 4 * self._scatter / max(self._ticks, 1)
 
-    def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array]:
-        """Contact (bool, (n,)) and values at rest (n, columns) of the n samples that end `delay` before the block does.
+    def update(self, measured: Array, high: Array, rest: Array | None = None) -> tuple[Array, Array, Array]:
+        """Contact (bool, (n,)), values less those at rest (n, columns) and thresholds (n,), `delay` samples late.
 
-        `measured` (n, columns) has the heave force (N) first, `high` (N, (n,)) is its upper threshold; `rest`
-        (n, columns) replaces what would be followed.
+        They are of the n samples that end so long before the block does.  `measured` (n, columns) has the heave force
+        (N) first, `high` (N, (n,)) is its upper threshold; `rest` (n, columns), of the samples of the result, replaces
+        what would be followed.
         """
         n = len(measured)
         joined, high = self._measured.before(measured), self._high.before(high)
         ahead = maximum_filter1d(joined[:, 0], self.delay + 1, origin=-((self.delay + 1) // 2))[:n]
         loaded, level = np.zeros(n, bool), np.zeros_like(measured)
-        delayed = np.empty(0) if rest is None else self._given.before(rest)
         first = 0
         while first < n:
             last = min(n, first + self._tick - (self._at + first) % self._tick)
             now = slice(first, last)
-            level[now] = self._rest if rest is None else delayed[now]
+            level[now] = self._rest if rest is None else rest[now]
             before = self._loaded
             loaded[now] = self._decide(joined[now, 0] - level[now, 0], ahead[now] - level[now, 0], high[now], first)
             if before and not loaded[now].all():
@@ -83,7 +83,7 @@ class ContactDetector:
             self._follow(joined[now], loaded[now], self._at + now.stop)
             first = now.stop
         self._at += n
-        return loaded, level
+        return loaded, joined[:n] - level, high[:n]
 
     def _decide(self, force: Array, ahead: Array, high: Array, first: int) -> Array:
         """Contact of a part of a tick: the last of the events on and off."""

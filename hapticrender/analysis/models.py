@@ -247,10 +247,9 @@ def _plate_patterns(impedance: Source | Sequence[Source], samples: Samples) -> A
     for number, each in enumerate(parts_of(impedance)):
         own = samples.source == number
         if isinstance(each, FingerRecord) and own.any():
-            errors, known = each.plate.standard_errors, [inf]  # of mass (kg), damping (N s/m), stiffness (N/m)
-            for name in ("damping", "stiffness"):
-                sides = [errors[f"{name}_{side}"].mean() for side in (1, 2) if f"{name}_{side}" in errors]
-                known.append(float(np.hypot(*sides)) if len(sides) == 2 else inf)
+            side = {name: error.mean() for name, error in each.plate.standard_errors.items()}
+            both = (np.hypot(side[f"{name}_1"], side[f"{name}_2"]) for name in ("damping", "stiffness"))
+            known = [inf, *both]  # of mass (kg), damping (N s/m), stiffness (N/m)
             room = [sqrt(2) * (samples.standard_error * factor)[own].min() for factor in (1 / w, 1.0, w)]
             mass, damping, stiffness = np.minimum(known, room)
             columns += [1j * w * mass * own, damping * own, stiffness / (1j * w) * own]

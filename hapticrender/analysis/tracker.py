@@ -97,7 +97,7 @@ class FingerTracker:
         self._given, self._at, self._first = rest, -self._filter.delay, 0
         self._history = History(self._line.behind + self._line.ahead + 2 * self._edge)
         self._held = np.zeros((1, self.course.plate.coils + 2))  # A, m: last drive and measurement
-        self._peak, self._delayed = History(round(PEAK * self.rate)), History(self._detector.delay)
+        self._peak = History(round(PEAK * self.rate))
 
     @property
     def latency(self) -> int:
@@ -142,11 +142,9 @@ class FingerTracker:
         self._at += len(drive)
         force = signals.residual(self.course.at(time), self.course.plate.half_spacing)
         measured = np.concatenate([force, signals.displacement], axis=1)
-        rest = None if self._given is None else self._given.at(time)
-        high = self._thresholds(signals)
-        loaded, rest = self._detector.update(measured, high, rest)
-        delayed = self._delayed.before(np.column_stack([measured, high]))[: len(drive)]
-        rows = np.column_stack([delayed[:, :4] - rest, loaded, delayed[:, 4]])
+        rest = None if self._given is None else self._given.at(time - self._detector.delay / self.rate)
+        loaded, moved, high = self._detector.update(measured, self._thresholds(signals), rest)
+        rows = np.column_stack([moved, loaded, high])
         return self._touch(self._history.before(rows), len(drive))
 
     def _thresholds(self, signals: Signals) -> Array:

@@ -98,7 +98,7 @@ class TouchMonitor:
         self._variance = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit) ** 2  # of a sensor's noise (m2)
         self._noise = self._noise_density()
         largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
-        self._prior = np.diag(np.append(np.repeat(largest, 3), DELAY_ERROR) ** -2.0)
+        self._prior = np.diag(np.r_[np.repeat(largest, 3), DELAY_ERROR, 1.0, 1.0] ** -2.0)
         self._information, self._known = self._prior.copy(), np.zeros(len(self._prior))
         self._rest: Array | None = None  # force that the free plate leaves at 0 Hz: offsets of the sensors
         self._free: Array | None = None  # last window of the free plate, until no touch is seen to follow
@@ -176,8 +176,11 @@ class TouchMonitor:
         return parts[0] - model.stiffness @ parts[1] - model.damping @ parts[2] - model.mass @ parts[3]
 
     def _regressors(self, parts: Array) -> Array:
-        """Forces per error of K, C and M (entries 11, 12, 22 each) and per sample of delay, shape (2, 10, length)."""
-        found = np.zeros((2, 10, parts.shape[-1]))
+        """Forces per error of K, C and M (entries 11, 12, 22 each) and per sample of delay, shape (2, 12, length).
+
+        The last two entries are for a late position: 0.
+        """
+        found = np.zeros((2, 12, parts.shape[-1]))
         for row in (0, 1):
             found[row, row:9:3], found[row, row + 1 : 9 : 3] = parts[1:, 0], parts[1:, 1]
             found[row, 9] = np.gradient(parts[0, row])
@@ -206,11 +209,10 @@ class TouchMonitor:
         lever = uniform_filter1d(lever, max(round(SMOOTHED * self.model.rate), 1), mode="nearest")
         force, per_error = self._force(parts), self._regressors(parts)
         along, across = self._spectrum(force[0]), self._spectrum(force[1] - lever * force[0])
-        rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
         speed = self.model.rate * np.gradient(lever)
         changes = [LATENESS * speed, LATENESS**2 / 2.0 * self.model.rate * np.gradient(speed)]  # of the lever arm
-        late = self._spectrum(np.array(changes) * force[0])
-        rows = np.vstack([rows[0], late]), np.vstack([rows[1], 0.0 * late])
+        per_error[1, 10:] = np.array(changes) * force[0]
+        rows = self._spectrum(per_error[1] - lever * per_error[0]), self._spectrum(per_error[0])
         if self._rest is None:
             along, across, rows = along[1:], across[1:], (rows[0][:, 1:], rows[1][:, 1:])
         else:
@@ -228,18 +230,13 @@ class TouchMonitor:
 
     def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
         """T without its term of d, for one d: least squares over the plate's errors and the position's lateness."""
-        from scipy.linalg import block_diag
-
         combine = np.array([-lever, 1.0])
         variance = np.einsum("i,kij,j->k", combine, noise, combine)
         weight = 2.0 / variance
         if left.size > self._bins.size:
             weight[0] = 1.0 / variance[0]
-        late = len(rows) - len(self._known)  # further errors, each of variance 1
-        information = block_diag(self._information, np.eye(late))
-        known = np.pad(self._known, (0, late))
-        matrix = information + ((rows.conj() * weight) @ rows.T).real
-        vector = known + ((rows.conj() * weight) @ left).real
+        matrix = self._information + ((rows.conj() * weight) @ rows.T).real
+        vector = self._known + ((rows.conj() * weight) @ left).real
         fixed = self._known @ np.linalg.solve(self._information, self._known)
         return float(np.sum(weight * abs(left) ** 2) + fixed - vector @ np.linalg.solve(matrix, vector))
 

@@ -3,7 +3,7 @@
 import csv
 import os
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,12 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.checks import number, require, show
 from hapticrender.protocols import Array
-from hapticrender.recordings.formats import h5_arrays, mat_arrays, naming_damage, npz_arrays
+from hapticrender.recordings.formats import CONTAINERS, naming_damage
 from hapticrender.recordings.journal import Header, join
 from hapticrender.touch.scene import Custom, Scene
 
 METHOD = "recorded elsewhere"
 EVEN = 0.5  # samples: farthest that a time may be from its place on an even grid
-CONTAINERS: dict[str, tuple[Callable[[Path], Any], str]] = {  # what reads their arrays, and what they are
-    ".mat": (mat_arrays, "a MAT file"),
-    **dict.fromkeys((".h5", ".hdf5"), (h5_arrays, "an HDF5 file")),
-    ".npz": (npz_arrays, "an NPZ file of arrays"),
-}
 Scale = float | tuple[float, float]
 Chosen = str | Sequence[str] | Mapping[str, Scale]
 

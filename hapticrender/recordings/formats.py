@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticrender.errors import HapticError
 from hapticrender.protocols import Array
-from hapticrender.recordings.journal import Header, chunks, join, read_journal, refuse_open, split, write_journal
+from hapticrender.recordings.journal import Header, chunks, column, join, read_journal, refuse_open, write_journal
 
 Arrays = dict[str, tuple[float, Callable[[], Any]]]  # of a file, by name: bytes (NaN: not here), and what reads it
 
@@ -104,7 +104,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def _values(header: Header, frames: Any) -> dict[str, Any]:
     """All signals by name, with header, time and rate."""
-    signals = split(header, frames[:])
+    rows = frames[:]
+    signals = {name: column(header, rows, name) for name in header.slices}
     return {"header": header.to_json(), "rate": header.rate, "time": np.arange(len(frames)) / header.rate, **signals}
 
 
@@ -236,13 +237,15 @@ def _read_csv(path: Path) -> tuple[Header, Array]:
     return header, numbers[:, 1:]
 
 
+CONTAINERS: dict[str, tuple[Callable[[Path], Any], str]] = {  # what reads their arrays, and what they are
+    ".mat": (mat_arrays, "a MAT file"),
+    **dict.fromkeys((".h5", ".hdf5"), (h5_arrays, "an HDF5 file")),
+    ".npz": (npz_arrays, "an NPZ file of arrays"),
+}
 READERS: dict[str, Callable[[Path], tuple[Header, Any]]] = {
     ".au": read_journal,
-    ".npz": _reader(npz_arrays),
-    ".h5": _reader(h5_arrays),
-    ".hdf5": _reader(h5_arrays),
-    ".mat": _reader(mat_arrays),
     ".csv": _read_csv,
+    **{suffix: _reader(arrays) for suffix, (arrays, _) in CONTAINERS.items()},
 }
 WRITERS: dict[str, Callable[[Path, Header, Any], None]] = {
     ".au": write_journal,

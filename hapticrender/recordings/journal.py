@@ -132,15 +132,11 @@ class Header(Validated):
         }
 
     @cached_property
-    def widths(self) -> dict[str, int]:
-        """Number of columns of each signal."""
-        return {name: len(columns) for name, columns in self.columns.items()}
-
-    @cached_property
     def slices(self) -> dict[str, slice]:
         """Columns of each signal."""
-        ends = np.cumsum(list(self.widths.values())).tolist()
-        return {name: slice(end - width, end) for (name, width), end in zip(self.widths.items(), ends, strict=True)}
+        widths = [len(columns) for columns in self.columns.values()]
+        pairs = zip(widths, np.cumsum(widths).tolist(), strict=True)
+        return {name: slice(end - width, end) for name, (width, end) in zip(self.columns, pairs, strict=True)}
 
     @property
     def drive_units(self) -> tuple[str, ...]:
@@ -247,13 +243,11 @@ def read_journal(path: Path) -> tuple[Header, Array | JournalFrames]:
     return header, JournalFrames(path, offset, columns)
 
 
-def split(header: Header, frames: Array) -> dict[str, Array]:
-    """Signals by name, as native arrays: target complex, flags integer, position, load, reference one-dimensional."""
-    return {name: column(header, frames, name) for name in header.slices}
-
-
 def column(header: Header, frames: Array, name: str) -> Array:
-    """One signal of `frames` by name; a view where the bytes allow it."""
+    """One signal of `frames` by name, as a native array; a view where the bytes allow it.
+
+    The target is complex, flags are integers, position, load and reference have one dimension.
+    """
     values = np.asarray(frames[:, header.slices[name]], float)
     if name == "target":
         return np.ascontiguousarray(values).view(complex)
@@ -263,7 +257,7 @@ def column(header: Header, frames: Array, name: str) -> Array:
 
 
 def join(header: Header, signals: dict[str, Array]) -> Array:
-    """Frames (n, columns) from signals by name; the inverse of `split`, and it checks every shape."""
+    """Frames (n, columns) from signals by name; the inverse of `column`, and it checks every shape."""
     for name in header.slices:
         require(name in signals, name, None, "an array with a row a sample")
     count = len(signals["drive"])

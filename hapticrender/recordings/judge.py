@@ -82,13 +82,13 @@ def _band(recording: Recording, k: int, judged: Array, places: list[str]) -> dic
     lead = achieved[:, 0] * target.conj()
     lead = np.where(envelopes.backward[judged, k], lead.conj(), lead)  # a lead stays a lead on the way back
     some = bool(judged.any())
-    mean = _mean(np.abs(target))
+    mean = float(np.mean(np.abs(target))) if some else None
     frequency = envelopes.frequency[judged, k]
     figures: dict[str, Any] = {
         "frequency": float(bands.frequency[k]) if not wavenumber else float(np.median(frequency)) if some else None,
         "wavelength": 1 / wavenumber if wavenumber else None,
         "target": mean,
-        "achieved": _mean(np.abs(achieved[:, 0])),
+        "achieved": float(np.mean(np.abs(achieved[:, 0]))) if some else None,
         "phase_error": float(np.angle(lead.mean())) if some else None,
         "settling_time": _settling_time(envelopes, k, min(SETTLED_FOR, SETTLED_SHARE * judged_seconds)),
         "judged_windows": int(judged.sum()),
@@ -243,7 +243,3 @@ def _notes(recording: Recording, bands: list[dict[str, Any]], settled: Array, to
             "zero, the finger is up, or the carrier is slower than 20 Hz, out of range, or too close to another"
         )
     return notes
-
-
-def _mean(values: Array) -> float | None:
-    return float(np.mean(values)) if values.size else None

@@ -16,11 +16,11 @@ from hapticrender.bands import Bands
 from hapticrender.checks import integer, require
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings import formats, journal
+from hapticrender.recordings.columns import Chosen, assemble
 from hapticrender.recordings.journal import Header
 from hapticrender.touch.scene import Scene
 
 if TYPE_CHECKING:
-    from hapticrender.recordings.columns import Chosen
     from hapticrender.recordings.envelopes import Envelopes
 
 
@@ -345,7 +345,5 @@ class Recording:
         >>> made.drive[:, 0].tolist(), made.sensed[:, 0].round(9).tolist()
         ([-0.0, -0.1], [0.0, 9.76e-07])
         """
-        from hapticrender.recordings.columns import assemble
-
         chosen: Any = {"drive": drive, "sensed": sensed, "time": time, "position": position, "normal_load": normal_load}
         return cls(*assemble(columns, chosen, rate, carriers, **header))

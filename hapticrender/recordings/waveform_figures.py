@@ -9,8 +9,7 @@ E = rms_B(e)/rms_B(r) is the larger one by both: spectra hardly see the ends, th
 """
 
 import math
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -81,12 +80,11 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     noise = _noise(recording, *_band(rate)) / scales / math.sqrt(reference[inside].sum())
     found["sensor_noise"] = float(noise.max())
     for i, place in enumerate(places, start=1):
-        columns, share = spectrum[:, [0, i, i + len(places)]], float(abs(shares[i - 1]) / scales[i - 1])
         alike = float(weights @ power[:, i] / (weights @ power[:, 0]))
         whole_error = math.sqrt(max(alike, total[i] / total[0]))
         each = power[:, i] / np.maximum(power[:, 0], QUIET**2 * power[:, 0].mean())  # of quiet windows that loud
         errors = {"waveform_error": whole_error, "window_error": float(np.sqrt(np.percentile(each, WORST_WINDOWS)))}
-        thirds = _thirds(columns, frequency, rate, header.unit, partial(_floor, recording, rms, i - 1), share)
+        thirds = _thirds(recording, spectrum[:, [0, i, i + len(places)]], frequency, rms, i - 1)
         found["places"][place] = errors | {"sensor_noise": float(noise[i - 1])} | thirds
     found |= _likeness(frequency[inside], spectrum[inside, :2], cross[inside], float(shares[0] / scales[0]))
     return found | {"contacts": _contacts(recording, begin, stop, math.sqrt(power[:, 0].mean()))}
@@ -185,29 +183,27 @@ def _spectra(recording: Recording, begin: int, stop: int, segment: int) -> tuple
     return np.fft.rfftfreq(segment, 1 / recording.rate), np.asarray(power), np.asarray(cross)
 
 
-def _thirds(
-    spectrum: Array, frequency: Array, rate: float, unit: str, floor: Callable[[float], float], share: float
-) -> dict[str, Any]:
-    """Error of every third octave in B (on a plate, m, also above), and the largest; `share` is that of r there."""
+def _thirds(recording: Recording, spectrum: Array, frequency: Array, rms: float, place: int) -> dict[str, Any]:
+    """Error of every third octave in B (on a plate, m, also above) at a place, and the largest; `rms` is that of r.
+
+    The texture counts as no less than S_b over the bound, so that an error of S_b is on it.
+    """
+    header, rate = recording.header, recording.rate
+    share, scale = (float(each[place]) for each in _scales(header))
     low, high = _band(rate)
     found = {}
     for name, middle in zip(NOMINAL, THIRDS, strict=True):
-        if low <= middle / EDGE and middle * EDGE <= (HIGHEST * rate if unit == "m" else high):
-            reference, error, motion = spectrum[_within(frequency, middle / EDGE, middle * EDGE)].sum(axis=0)
-            if middle * EDGE > high:
-                error = min(error, max(math.sqrt(motion) - share * math.sqrt(reference), 0.0) ** 2)
-            found[f"{name:g} Hz"] = math.sqrt(error) / max(math.sqrt(reference), floor(middle))
+        edges = middle / EDGE, middle * EDGE
+        if low <= edges[0] and edges[1] <= (HIGHEST * rate if header.unit == "m" else high):
+            reference, error, motion = spectrum[_within(frequency, *edges)].sum(axis=0)
+            if edges[1] > high:
+                error = min(error, max(math.sqrt(motion) - abs(share) / scale * math.sqrt(reference), 0.0) ** 2)
+            felt = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale
+            noise = 2.0 * float(_noise(recording, *edges)[place]) / scale
+            least = max(felt if header.unit == "m" else SPUR * rms, noise) / (LOOSER * header.tolerance)
+            found[f"{name:g} Hz"] = math.sqrt(error) / max(math.sqrt(reference), least)
     worst = max(found, key=lambda name: found[name], default=None)
     return {"third_octave_error": found.get(worst or ""), "third_octave": worst, "third_octaves": found}
-
-
-def _floor(recording: Recording, rms: float, place: int, middle: float) -> float:
-    """Least rms that the texture counts as in a third octave: S_b over the bound, so that an error of S_b is on it."""
-    header = recording.header
-    scale = float(_scales(header)[1][place])
-    least = float(detection_threshold(middle, CURVE)) / math.sqrt(2.0) / scale if header.unit == "m" else SPUR * rms
-    noise = float(_noise(recording, middle / EDGE, middle * EDGE)[place]) / scale
-    return max(least, 2.0 * noise) / (LOOSER * header.tolerance)
 
 
 def _noise(recording: Recording, low: float, high: float) -> Array:

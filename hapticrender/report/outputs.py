@@ -3,9 +3,9 @@
 import errno
 import os
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,6 @@ from hapticrender.touch.scene import Scene
 JOURNAL = "recording.au"
 GENERATOR = '<meta name="generator" content="hapticrender">'  # in every page
 FILES = ("scene.toml", JOURNAL, "drive.wav", "sensed.wav", "picture.png", "summary.json")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Outputs:
-    """A folder with one rendered scene: its name, its figures and its TOML.
-
-    `summary` is ``Recording.summary()`` and, under "sound", the full scale (SI) of each WAV.
-    """
-
-    name: str
-    folder: Path
-    summary: Mapping[str, Any]
-    toml: str
 
 
 def check_folder(option: str, folder: Path) -> None:
@@ -70,21 +57,22 @@ def written_in(folder: Path) -> list[Path]:
     return [folder / name for name in FILES if (folder / name).exists()]
 
 
-def _text(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """Text of a file; nothing where there is none."""
     return path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
 
 
 def refuse_other_page(folder: Path) -> None:
     """Refuse a folder whose ``index.html`` this package has not written."""
     path = folder / "index.html"
-    if path.exists() and GENERATOR not in _text(path):
+    if path.exists() and GENERATOR not in text_of(path):
         raise ValueError(f"{str(path)!r}: is there and from no earlier run: choose another folder, or add --force")
 
 
 def refuse_to_overwrite(folder: Path, source: Path | None = None) -> None:
     """Refuse a folder in which files would be overwritten that no earlier run has written, or the scene `source`."""
     present = written_in(folder)
-    if present == [folder / "summary.json"] and GENERATOR in _text(folder / "index.html"):
+    if present == [folder / "summary.json"] and GENERATOR in text_of(folder / "index.html"):
         return  # the page of `play`, `demo` or `validate`
     for path in present:
         if source is not None and source.exists() and path.samefile(source):
@@ -138,8 +126,8 @@ def run_to_end(folder: Path, rendering: Rendering, progress: Progress | None = N
             return mismatch.recording
 
 
-def run_into(folder: Path, rendering: Rendering, *, progress: Progress | None = None) -> Outputs:
-    """Run a prepared `rendering` and write everything about it into `folder`; see `run_to_end`."""
+def run_into(folder: Path, rendering: Rendering, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Run a prepared `rendering` and write everything about it into `folder`; see `run_to_end`, `write_outputs`."""
     with naming_full(folder):
         return write_outputs(folder, run_to_end(folder, rendering, progress))
 
@@ -161,15 +149,18 @@ def remove_outputs(folder: Path) -> None:
         folder.rmdir()
 
 
-def write_outputs(folder: Path, recording: Recording) -> Outputs:
-    """Write sounds, picture and figures of a recording whose scene and journal are in `folder`."""
+def write_outputs(folder: Path, recording: Recording) -> dict[str, Any]:
+    """Write sounds, picture and figures of a recording whose scene and journal are in `folder`.
+
+    Returns ``Recording.summary()`` and, under "sound", the full scale (SI) of each WAV.
+    """
     header, sound = recording.header, {}
     for name, unit in (("drive", header.drive_unit), ("sensed", header.unit)):
-        if header.widths[name]:
+        if header.columns[name]:
             full_scale = write_sound(folder / f"{name}.wav", recording.read(name), header.rate, unit)
             sound[f"{name}.wav"] = {"full_scale": full_scale, "unit": unit}
     with suppress(MissingExtra):
         picture.plot(recording, folder / "picture.png")
     summary = {**recording.summary(), "sound": sound}
     (folder / "summary.json").write_text(as_json(summary), encoding="utf-8")
-    return Outputs(name=header.name, folder=folder, summary=summary, toml=header.scene)
+    return summary

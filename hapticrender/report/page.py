@@ -1,13 +1,14 @@
 """Write one page about many rendered scenes: plain HTML that opens from a file, without script, server or network."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from hapticrender import __version__
 from hapticrender.formatting import as_json, bands_label, short
-from hapticrender.report.outputs import GENERATOR, JOURNAL, Outputs
+from hapticrender.report.outputs import GENERATOR, JOURNAL, text_of
 from hapticrender.report.text import band_rows, conditions, overview, remarks, verdict, waveform_rows
 
 _MANY_BANDS = 10  # beyond so many their table is folded
@@ -17,24 +18,22 @@ CLASSES = {"passed": "good", "passed in band": "good", "failed": "bad", "not jud
 STYLE = "\n" + (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 
 
-def write_page(folder: Path, scenes: Sequence[Outputs]) -> Path:
-    """Write ``index.html`` and ``summary.json`` into `folder`, with links to the scenes' folders below it."""
-    report = {"hapticrender": __version__, "scenes": [scene.summary for scene in scenes]}
+def write_page(folder: Path, scenes: Mapping[Path, Mapping[str, Any]]) -> Path:
+    """Write ``index.html`` and ``summary.json`` into `folder`: introduction, table of all scenes, a section a scene.
+
+    `scenes` has, by their folders below it, what `outputs.write_outputs` returned of each.
+    """
+    summaries = list(scenes.values())
+    report = {"hapticrender": __version__, "scenes": summaries}
     (folder / "summary.json").write_text(as_json(report), encoding="utf-8")
-    path = folder / "index.html"
-    path.write_text(page(folder, scenes), encoding="utf-8")
-    return path
-
-
-def page(folder: Path, scenes: Sequence[Outputs]) -> str:
-    """HTML of the page: introduction, table of all scenes, contents, and a section a scene."""
-    counts = {kind: sum(scene.summary["verdict"] == kind for scene in scenes) for kind in CLASSES}
-    methods = " and ".join(sorted({f"“{scene.summary['method']}”" for scene in scenes}))
+    counts = {kind: sum(summary["verdict"] == kind for summary in summaries) for kind in CLASSES}
+    methods = " and ".join(sorted({f"“{summary['method']}”" for summary in summaries}))
     number = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
     apart = f", {counts['not judged']} cannot be judged" if counts["not judged"] else ""
-    links = [f'<a href="#{quote(scene.name)}">{escape(scene.name)}</a>' for scene in scenes]
-    sections = "\n".join(_section(scene, quote(scene.folder.relative_to(folder).as_posix())) for scene in scenes)
-    return html_page(
+    links = [f'<a href="#{quote(each["scene"])}">{escape(each["scene"])}</a>' for each in summaries]
+    places = (quote(place.relative_to(folder).as_posix()) for place in scenes)
+    sections = "\n".join(_section(*each) for each in zip(scenes, summaries, places, strict=True))
+    html = html_page(
         f"hapticrender: {number} in closed loop",
         f"""<h1>Textures, rendered in closed loop</h1>
 <p>hapticrender renders a texture for a bare finger: it vibrates a glass plate, or changes the friction of a screen,
@@ -43,10 +42,12 @@ models of the devices with the method {escape(methods)}. A scene misses its tole
 texture by more than that at any of its places, or by more than twice that in any third octave or in the worst of the
 windows of 100 ms: {counts["passed"] + counts["passed in band"]} of {len(scenes)} are within their tolerance,
 {counts["failed"]} miss it{apart}.</p>
-{_overview(scenes)}
+{_overview(summaries)}
 <nav>{"".join(links)}</nav>
 {sections}""",
     )
+    (folder / "index.html").write_text(html, encoding="utf-8")
+    return folder / "index.html"
 
 
 def html_page(title: str, body: str) -> str:
@@ -88,11 +89,11 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
     return html_table(html_row("th", head), [html_row("td", row) for row in body]) if body else ""
 
 
-def _overview(scenes: Sequence[Outputs]) -> str:
-    head, *rows = overview([scene.summary for scene in scenes])
+def _overview(summaries: Sequence[Mapping[str, Any]]) -> str:
+    head, *rows = overview(summaries)
     body = [
         html_row("td", [f'<a href="#{quote(name)}">{escape(name)}</a>', *map(_whole, cells)], f"wide {CLASSES[kind]}")
-        for (name, *cells), kind in zip(rows, (scene.summary["verdict"] for scene in scenes), strict=True)
+        for (name, *cells), kind in zip(rows, (summary["verdict"] for summary in summaries), strict=True)
     ]
     return f"""{html_table(html_row("th", head, "wide"), body)}
 <p class="note">Amplitudes are peak values, achieved ones at the centre; a scene of several bands shows the root of the
@@ -104,11 +105,11 @@ def _whole(text: str) -> str:
     return escape(text).replace(" %", "&nbsp;%").replace(" Hz", "&nbsp;Hz")
 
 
-def _section(scene: Outputs, folder: str) -> str:
-    """Everything about one scene; `folder` is its address relative to the page."""
-    summary, name, sentence = scene.summary, escape(scene.name), _whole(verdict(scene.summary))
+def _section(place: Path, summary: Mapping[str, Any], folder: str) -> str:
+    """Everything about one scene, whose files are in `place`; `folder` is its address relative to the page."""
+    name, sentence = escape(summary["scene"]), _whole(verdict(summary))
     picture = NO_PICTURE
-    if (scene.folder / "picture.png").exists():
+    if (place / "picture.png").exists():
         alt = f"Target, achieved motion, drive and finger over time: {name}"
         picture = f'<a href="{folder}/picture.png"><img src="{folder}/picture.png" alt="{alt}"></a>'
     files = ["scene.toml", "summary.json", JOURNAL, *summary["sound"]]
@@ -132,6 +133,6 @@ def _section(scene: Outputs, folder: str) -> str:
 <div class="halves">
 <div>{notes}{sounds}
 <p class="note">{links}</p></div>
-<pre>{escape(scene.toml.strip())}</pre>
+<pre>{escape(text_of(place / "scene.toml").strip())}</pre>
 </div>
 </section>"""

@@ -179,7 +179,12 @@ def _errors(axes: Any, recording: Recording) -> None:
     names = [name.removesuffix(" Hz") for name in next(iter(figures.values()), {})]
     allowed = 100 * LOOSER * recording.header.tolerance
     axes.axhline(allowed, color=INK, lw=1, ls=DASHED, label="bound")
-    low, high = error_axis(axes, allowed)
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    low, high = min(low, allowed / 30) / 1.5, 1.5 * max(high, allowed)
+    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.minorticks_off()
+    axes.grid(axis="x", visible=False)
     axes.axhspan(allowed, high, color=RED, alpha=0.08, lw=0)
     axes.set_ylim(low, high)
     axes.text(0.01, allowed, f"{allowed:.3g} %", fontsize=8, va="bottom", transform=axes.get_yaxis_transform())
@@ -187,16 +192,6 @@ def _errors(axes: Any, recording: Recording) -> None:
     axes.set_xlim(-0.6, max(len(names), 1) - 0.4)
     axes.set(title="Third octaves", ylabel="error (%)", xlabel="Hz")
     legend(axes, columns=4)
-
-
-def error_axis(axes: Any, bound: float) -> tuple[float, float]:
-    """Make the y axis one of errors in percent, logarithmic, and return limits that show `bound`."""
-    axes.set_yscale("log")
-    low, high = axes.get_ylim()
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.minorticks_off()
-    axes.grid(axis="x", visible=False)
-    return min(low, bound / 30) / 1.5, 1.5 * max(high, bound)
 
 
 def _drive(lanes: list[Any], recording: Recording, summary: dict[str, Any]) -> None:

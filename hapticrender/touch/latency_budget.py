@@ -94,10 +94,6 @@ def phase_error(panel: TouchPanel, speed: float, wavelength: float, **path: floa
     return 360.0 * position_error(panel, speed, **path) / turn  # type: ignore[arg-type]
 
 
-def finest_wavelength(
-    panel: TouchPanel, speed: float, *, degrees: float = 30.0, highest: float = math.inf, **path: float
-) -> float:
-    """Finest grating (m) with a phase error of `degrees` rms, and at most `highest` (Hz) at the peak `speed` (m/s)."""
-    allowed = number("degrees", degrees, above=0.0) / 360.0
-    require(highest > 0.0, "highest", highest, "> 0 Hz, math.inf where there is no limit")
-    return max(position_error(panel, speed, **path) / allowed, speed / highest)  # type: ignore[arg-type]
+def finest_wavelength(panel: TouchPanel, speed: float, *, degrees: float = 30.0, **path: float) -> float:
+    """Finest grating (m) with a phase error of `degrees` rms at the peak `speed` (m/s)."""
+    return position_error(panel, speed, **path) / (number("degrees", degrees, above=0.0) / 360.0)  # type: ignore[arg-type]

@@ -31,16 +31,6 @@ FELT = (20.0, 1000.0)  # Hz: what is played by default, up to where vibration is
 CARRIED = (20.0, 400.0)  # where carriers are chosen
 ENDS = 3.0  # periods of the lowest frequency: so far a kink where a recording is reflected reaches (a sine's: 0.3 %)
 
-Passband = tuple[float, float]
-
-
-def _carriers(frequency: Array, speed: float | None, rate: float) -> Bands:
-    """Bands whose envelopes are to be analysed: over position, or over time below rate/2."""
-    if speed is None:
-        frequency = frequency[frequency < rate / 2]
-        return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
-    return Bands(frequency=0 * frequency, wavenumber=frequency / speed, phase=0 * frequency)
-
 
 def _peak(values: Array, ends: int = 0) -> float:
     """Peak of what is not constant, but for `ends` samples at each end."""
@@ -91,7 +81,7 @@ class Recorded(Validated, Composable):
     gain: float | None = parameter(None, "m per unit of the file", above=0, most=1e3)
     carriers: int | None = parameter(None, least=1, most=MOST_CARRIERS)
     spacing: float = parameter(40.0, "Hz", least=0.1, most=1e5)
-    passband: Passband | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
+    passband: tuple[float, float] | None = checked(numbers, None, unit="Hz", least=1.0, most=1e5, count=2)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -146,14 +136,18 @@ class Recorded(Validated, Composable):
         self.bands(rate=np.inf)
 
     def bands(self, rate: float) -> Bands:
-        """Carriers at the strongest peaks of the spectrum below rate/2 (`rate` in Hz); envelopes are to be analysed.
+        """Carriers at the strongest peaks of the spectrum; their envelopes are to be analysed.
 
-        None without `carriers`: the whole waveform is played.
+        Over time they are below rate/2 (`rate` in Hz).  None without `carriers`: the whole waveform is played.
         """
         if self.carriers is None:
             return Bands.none(spatial=self.spatial)
         curve, chosen = self.curve, {"count": self.carriers, "spacing": self.spacing, "passband": self.passband}
-        return _carriers(strongest_carriers(curve.values, 1 / curve.step, **chosen), self.speed, rate)  # type: ignore[arg-type]
+        frequency = strongest_carriers(curve.values, 1 / curve.step, **chosen)  # type: ignore[arg-type]
+        if self.speed is not None:
+            return Bands(frequency=0 * frequency, wavenumber=frequency / self.speed, phase=0 * frequency)
+        frequency = frequency[frequency < rate / 2]
+        return Bands(frequency=frequency, wavenumber=0 * frequency, phase=0 * frequency)
 
     def waveform(self, time: Array, position: Array) -> Array:
         """Target displacement (m, shape (n,)); a spatial recording is still where `position` (m) is NaN."""
