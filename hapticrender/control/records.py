@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, kernel, pointer, record
+from hapticrender.jit import F8, kernel, pointer
 from hapticrender.jit import aligned as aligned
 from hapticrender.protocols import Array
 from hapticrender.vectors import W, tile_type
@@ -125,7 +125,7 @@ CONTROLLER = np.dtype(
         *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
 )
-"""Settings and state of a controller, and the addresses of its arrays."""
+"""Settings and state of a controller, and the addresses of its arrays; kernels take it as `c`, by reference."""
 CONTROLLER_T = numba.from_dtype(CONTROLLER)
 TILE_T, LOW_PASS_T, WORK_T, PAIR_T = map(tile_type, (TILE, LOW_PASS, WORK, PAIR))
 COORDINATE_T, STIFFNESS_T = (tile_type(_record(_complex(*names))) for names in (COORDINATE_NAMES, STIFFNESS_NAMES))
@@ -140,21 +140,20 @@ SAMPLE_ROWS = 14
 
 
 @kernel
-def coordinates_of(controller, t):
+def coordinates_of(c, t):
     """Address of the records of a tile's coordinates, of type `COORDINATE_T`."""
-    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + COORDINATES_AT
+    return c.tiles_at + t * TILE_SIZE + COORDINATES_AT
 
 
 @kernel
-def stiffnesses_of(controller, t):
+def stiffnesses_of(c, t):
     """Address of the records of the law between a tile's coordinates i and j, number 2 i + j of type `STIFFNESS_T`."""
-    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + STIFFNESSES_AT
+    return c.tiles_at + t * TILE_SIZE + STIFFNESSES_AT
 
 
 @kernel
-def samples_of(controller):
+def samples_of(c):
     """Work array of the samples, shape (rows, groups g); samples beyond M stay zero but for the sums."""
-    c = record(controller, CONTROLLER_T, 0)
     return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.groups * c.p.group))
 
 
