@@ -47,7 +47,7 @@ PART = np.dtype(
         ("scale_waveform", np.float64),  # of the part per waveform of both
         ("heat", np.float64, (MOST_CHANNELS,)),  # of a part without target: means of the squares of its drives,
         ("heat_decay", np.float64),  # and the share of them that a block leaves
-        *((f"{name}_at", np.int64) for name in ("sensed", "drive", "waveform", "target", "flags", "position")),
+        *((f"{name}_at", np.int64) for name in ("sensed", "drive", "waveform", "target")),
     ]
 )
 COMBINED = np.dtype([*((name, np.int64) for name in ("bands", "channels", "sensors", "block")), ("parts", PART, (2,))])
@@ -60,8 +60,7 @@ def combined_step(state, signals, start, count):
     c, io = record(state, COMBINED_T, 0), record(signals, SIGNALS_T, 0)
     block, stop = c.block, start + count
     sensed, drive = carray(pointer(io.sensed, F8), (stop, c.sensors)), carray(pointer(io.drive, F8), (stop, c.channels))
-    position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
-    target, flags = carray(pointer(io.target, C16), (stop // block, c.bands)), carray(pointer(io.flags, I8), stop)
+    waveform, target = carray(pointer(io.waveform, F8), stop), carray(pointer(io.target, C16), (stop // block, c.bands))
     for first in range(start, stop, block):
         sensor = channel = 0
         row = first // block
@@ -73,13 +72,13 @@ def combined_step(state, signals, start, count):
                 carray(pointer(p.sensed_at, F8), (block, p.sensors)),
                 carray(pointer(p.drive_at, F8), (block, p.channels)),
             )
-            place, part_waveform = carray(pointer(p.position_at, F8), block), carray(pointer(p.waveform_at, F8), block)
-            goal, raised = carray(pointer(p.target_at, C16), (1, p.bands)), carray(pointer(p.flags_at, I8), block)
-            index = carray(pointer(p.index, I8), p.bands)
+            goal, index = carray(pointer(p.target_at, C16), (1, p.bands)), carray(pointer(p.index, I8), p.bands)
+            part_io, part_waveform = record(p.signals, SIGNALS_T, 0), carray(pointer(p.waveform_at, F8), block)
+            part_io.position, part_io.flags = io.position + 8 * first, io.flags + 8 * first
             for m in range(block):
                 for s in range(p.sensors):
                     own[m, s] = sensed[first + m, sensor + s]
-                place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
+                part_waveform[m] = p.scale_waveform * waveform[first + m]
             if p.step != 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for k in range(MOST_CHANNELS):
@@ -87,7 +86,6 @@ def combined_step(state, signals, start, count):
             for m in range(block):
                 for k in range(p.channels):
                     drive[first + m, channel + k] = out[m, k]
-                flags[first + m] |= raised[m]
             for k in range(p.bands):
                 scale = p.scale
                 if scale == 0.0:
@@ -130,8 +128,6 @@ class CombinedController(Addressed):
                 "drive": np.zeros((self.block, channels[i])),
                 "waveform": np.zeros(self.block),
                 "target": np.zeros((1, count), complex),
-                "flags": np.zeros(self.block, np.int64),
-                "position": np.zeros(self.block),
             }
             signals = addresses(**arrays)
             self._buffers += [*arrays.values(), indices[i], signals]
