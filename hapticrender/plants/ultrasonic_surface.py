@@ -185,8 +185,33 @@ class UltrasonicSurface(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.loop = parameters, amplitude
         self.noise_channels = 1 + parameters.substeps
-        self.state, queue = surface_record(parameters, amplitude, nominal)
+        p, mode, ours = parameters, parameters.carrier_mode, isinstance(amplitude, BankController)
+        inner, queue = mode_record(mode, mode.delay - 1)
+        if p.sensor == "amplitude" and not ours:
+            raise TypeError(
+                f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
+            )
         self.buffers = (queue,)
+        self.state = record_of(
+            SURFACE,
+            p,
+            load=nominal[0],
+            speed=nominal[1],
+            slew=full_slew(mode),
+            free_damping=float(mode.damping()),
+            estimating=p.sensor == "amplitude",
+            controller=amplitude.step.address,
+            controller_state=amplitude.state,
+            finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
+            position=np.nan,
+            reached=-1.0,
+            law=p.friction_law.numbers,
+            mode=inner[0],
+            sliding=sliding_record(p)[0],
+        )
+        for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
+            self.state["signals"][name] = self.state[name].ctypes.data
+        self.state["signals_at"] = self.state["signals"].ctypes.data
 
     def inputs(self, first: int, n: int) -> Array:
         """Inputs of the finger, then damping (N s/m) and resonance (rad/s) of the mode, shape (n, 6)."""
@@ -196,35 +221,3 @@ class UltrasonicSurface(CompiledPlant):
     def amplitude(self) -> Array:
         """True amplitude of the mode (m, shape (n,)) in each sample of the last run."""
         return self.motion[:, AMPLITUDE]
-
-
-def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the record (`SURFACE`, shape (1,)) of a surface at rest, and its drive's queue."""
-    p, mode = parameters, parameters.carrier_mode
-    inner, queue = mode_record(mode, mode.delay - 1)
-    ours = isinstance(amplitude, BankController)
-    if p.sensor == "amplitude" and not ours:
-        raise TypeError(
-            f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
-        )
-    record = record_of(
-        SURFACE,
-        p,
-        load=nominal[0],
-        speed=nominal[1],
-        slew=full_slew(mode),
-        free_damping=float(mode.damping()),
-        estimating=p.sensor == "amplitude",
-        controller=amplitude.step.address,
-        controller_state=amplitude.state,
-        finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
-        position=np.nan,
-        reached=-1.0,
-        law=p.friction_law.numbers,
-        mode=inner[0],
-        sliding=sliding_record(p)[0],
-    )
-    for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
-        record["signals"][name] = record[name].ctypes.data
-    record["signals_at"] = record["signals"].ctypes.data
-    return record, queue
