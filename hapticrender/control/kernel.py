@@ -257,7 +257,7 @@ def synthesise_block(c):
         if quadrature == 0:
             for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
-        peak = max(peak, largest_drive(c, samples, Y, SUM, quadrature > 0))
+        peak = max(peak, largest_drive(c, samples, quadrature > 0))
     for t in range(c.tiles):
         for i in range(c.p.coordinates):
             x = record(coordinates_of(c, t), COORDINATE_T, i)
@@ -362,8 +362,8 @@ def error_step(state, signals, start, count):
         innovate_sample(c)
         close_block(c, touching, adapt_now)
         apply_law(c)
-        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(c, samples, Y, SUM, True))
-        limit_drive(c, samples, Y, peak, drive, flags, n)
+        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(c, samples, True))
+        limit_drive(c, samples, peak, drive, flags, n)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             flags[n] |= UNLOCKED
     return 0
@@ -388,7 +388,7 @@ def block_step(state, signals, start, count):
         close_block(c, touching, True)
         apply_law(c)
         peak = synthesise_block(c)
-        limit_drive(c, samples, Y, peak, drive, flags, first)
+        limit_drive(c, samples, peak, drive, flags, first)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             for m in range(block):
                 flags[first + m] |= UNLOCKED

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from hapticrender.control.records import SUM, Y
 from hapticrender.jit import kernel
 
 NEAR_LIMIT = 0.25  # of the limit, squared: from here on the envelope of the drive counts, not its samples alone
@@ -28,19 +29,19 @@ def drive_of(c, samples, row, m, i):
 
 
 @kernel
-def largest_drive(c, samples, force, quadrature, with_quadrature):
+def largest_drive(c, samples, with_quadrature):
     """Largest drive of a block over its limit, squared: of the samples, or of the analytic signal's envelope."""
     peak, scale = 0.0, c.confidence / c.p.drive_limit
     for i in range(c.p.channels):
         for m in range(c.p.block):
-            along = drive_of(c, samples, force, m, i)
-            across = drive_of(c, samples, quadrature, m, i) if with_quadrature else 0.0
+            along = drive_of(c, samples, Y, m, i)
+            across = drive_of(c, samples, SUM, m, i) if with_quadrature else 0.0
             peak = max(peak, along * along + across * across)
     return scale * scale * peak
 
 
 @kernel
-def limit_drive(c, samples, force, peak, drive, flags, first):
+def limit_drive(c, samples, peak, drive, flags, first):
     """Scale the whole envelope into the limit, round, and write the drive of a block."""
     confidence, limit, block = c.confidence, c.p.drive_limit, c.p.block
     before, after = c.scale, 1.0 / math.sqrt(peak) if peak > 1.0 else 1.0
@@ -48,7 +49,7 @@ def limit_drive(c, samples, force, peak, drive, flags, first):
     for m in range(block):
         scale = confidence * (before + (after - before) * (m + 1.0) / block)
         for i in range(c.p.channels):
-            exact = scale * drive_of(c, samples, force, m, i)
+            exact = scale * drive_of(c, samples, Y, m, i)
             if confidence == 0.0:
                 c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
             elif c.p.drive_step > 0.0:
