@@ -142,6 +142,6 @@ def adapt_finger(c, observer, damper):
         sum_k, sum_m, sum_b, weights = sum_k + part_k, sum_m + part_m, sum_b + part_b, weights + weight
     weight = total(weights)
     step = gain / rate / (weight if weight > 0.0 else 1.0)
-    c.finger_stiffness = min(max(c.finger_stiffness + step * total(sum_k), p.least_stiffness), p.most_stiffness)
-    c.finger_mass = min(max(c.finger_mass - step * total(sum_m), p.least_mass), p.most_mass)
-    c.finger_damping = min(max(c.finger_damping + step * total(sum_b), p.least_damping), p.most_damping)
+    c.finger_stiffness = min(max(c.finger_stiffness + step * total(sum_k), p.stiffness_range[0]), p.stiffness_range[1])
+    c.finger_mass = min(max(c.finger_mass - step * total(sum_m), p.mass_range[0]), p.mass_range[1])
+    c.finger_damping = min(max(c.finger_damping + step * total(sum_b), p.damping_range[0]), p.damping_range[1])

@@ -223,14 +223,10 @@ def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
     }
 
 
-def _finger(finger: FingerRange) -> dict[str, float]:
+def _finger(finger: FingerRange) -> dict[str, Any]:
     """How contact is detected, and what may be estimated of it."""
     on, off = finger.contact or (ALWAYS, ALWAYS)
-    bounds = {
-        f"{which}_{name}": getattr(finger, name)[i]
-        for name in ("mass", "damping", "stiffness")
-        for i, which in enumerate(("least", "most"))
-    }
+    bounds = {f"{name}_range": getattr(finger, name) for name in ("mass", "damping", "stiffness")}
     typical = {name: getattr(finger, name) for name in ("least_motion", "typical_mass", "typical_stiffness")}
     return {"contact_on": on, "contact_off": off, **typical, **bounds}
 

@@ -84,13 +84,13 @@ integral integral_medium integral_high damper damper_high
 detects fast_pole slow_pole fast_threshold slow_threshold fast_time slow_time release
 contact_on contact_off contact_damping typical_speed lock
 adaptation adaptation_high rest rest_high age least_motion typical_mass typical_stiffness
-least_mass most_mass least_damping most_damping least_stiffness most_stiffness
 polar clamped subtracted feedback forward deviation dynamic table_step
 """.split()
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
+        *((f"{name}_range", np.float64, (2,)) for name in ("mass", "damping", "stiffness")),  # of a finger
         ("pattern", np.float64, (2,)),
         ("added_damping", np.float64, (2,)),
         ("damper_noise", np.float64, (2,)),  # N rms beyond `RINGING`, of `damper_force` by sensor noise; 0: unknown
