@@ -191,12 +191,11 @@ def low_pass_settings(
     """
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
     analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * width, spacing(bands))
-    ridges = ridge_spacing(bands)
     refuse_whole_waveform(bands)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "waveform_gain": 2 * analysis / model.rate,
-        "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
+        "crowd_speed": analysis / ridge_spacing(bands),
         "highest_edge": HIGHEST_EDGE,
         "feedback": feedback,
     }
