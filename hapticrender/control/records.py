@@ -119,8 +119,8 @@ CONTROLLER = np.dtype(
         ("p", SETTINGS),
         *((name, np.float64) for name in _STATE),
         *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation", "damper_force")),
-        ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
+        ("past", np.float64, (2, MOST_TAPS)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "locked", "stale", "implausible")),
         *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
