@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,9 +21,7 @@ from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap_estimator import VACUUM, gap_record
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger
 
 DRY, NORMAL, MOIST = 100.0, 4.0, 0.5  # ohm m2: leakage of the gap (engineering defaults: L = 1.0, 0.90, 0.12)
 BLOCKING = 1e6  # s: time constant of a capacitor that does not leak
