@@ -146,8 +146,6 @@ def innovate_sample(c):
     command.
     """
     samples, now, p = samples_of(c), c.sample & PAST_MASK, c.p
-    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(p.coordinates):
         shown, command = predict(c, i)
         if samples[Y + i, 0] != samples[Y + i, 0]:  # invalid: hold the prediction
@@ -161,8 +159,8 @@ def innovate_sample(c):
         c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
         error = samples[Y + i, 0] - shown - c.dc[i]
         samples[Y + i, 0] = error
-        c.dc[i] += c.dc_drift[i] + gain * error
-        c.dc_drift[i] += drift * error
+        c.dc[i] += c.dc_drift[i] + c.dc_gain * error
+        c.dc_drift[i] += c.dc_drift_gain * error
 
 
 @kernel
@@ -175,8 +173,6 @@ def innovate_block(c):
             envelope = p.pattern[i] * get(b, "expected") + get(record(coordinates_of(c, t), COORDINATE_T, i), "e")
             put(record(c.work_at, WORK_T, 2 * t + i), "x", envelope * get(b, "carrier"))
     sum_bands(c, p.coordinates, False)
-    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
     for i in range(p.coordinates):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
@@ -185,8 +181,8 @@ def innovate_block(c):
         solve(c, Y + i, INVERSE)
         gained = steeper = 0.0
         for m in range(block):
-            gained += (gain + (block - 1 - m) * drift) * samples[Y + i, m]
-            steeper += drift * samples[Y + i, m]
+            gained += (c.dc_gain + (block - 1 - m) * c.dc_drift_gain) * samples[Y + i, m]
+            steeper += c.dc_drift_gain * samples[Y + i, m]
         c.dc[i] += block * c.dc_drift[i] + gained
         c.dc_drift[i] += steeper
     correlate(c, Y, p.coordinates)
@@ -290,8 +286,9 @@ def begin(c, io, first):
     if p.lock > 0.0 and (block > 1 or c.sample % REFRESH == 0):
         follow_resonance(c)
     advance_carriers(c)
-    c.dc_fast_on = 1.0 if p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0) else 0.0
-    c.feedback_off = 1.0 if c.dc_fast_on > 0.0 or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
+    fast = p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0)
+    c.dc_gain, c.dc_drift_gain = (p.dc_fast, p.dc_drift_fast) if fast else (p.dc, p.dc_drift)
+    c.feedback_off = 1.0 if fast or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
     c.gain = crowding(c) * (p.observer + c.fast_open * (p.observer_high - p.observer)) * (1.0 - c.feedback_off)
 
 

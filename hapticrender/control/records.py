@@ -111,7 +111,7 @@ _STATE = """
 held_position held_prediction smooth_position velocity acceleration finger_seen fresh speed smooth_speed table_velocity
 load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
-gain damping_gain damper_scale dc_fast_on feedback_off
+gain damping_gain damper_scale dc_gain dc_drift_gain feedback_off
 """.split()
 _ARRAYS = "tiles loops commands setpoints work table phasors samples window gains"
 CONTROLLER = np.dtype(
