@@ -159,7 +159,7 @@ def pointer(typingctx: Any, address: Any, dtype: Any) -> Any:
 def record(typingctx: Any, address: Any, dtype: Any, index: Any) -> Any:
     """Record of `dtype` (a numba type) number `index` of those that lie at an address; reads and writes go there.
 
-    Kernels hand each other addresses, not arrays of records: a call then costs no more than its numbers.
+    Kernels hand each other records or addresses, not arrays of records: a call then costs no more than its numbers.
     """
     kind = dtype.instance_type
 

@@ -161,7 +161,7 @@ def follow_finger(entry, slot, m):
     if e.given != 0:
         position[m] = carray(pointer(e.given, F8), 1)[e.taken + m]
         c = record(e.tracker, CONTROLLER_T, 0)
-        track_finger(e.tracker, position[m])
+        track_finger(c, position[m])
         there = position[m] + ahead * (c.velocity + 0.5 * ahead * c.acceleration)
     else:
         age = (e.age + m) / e.rate

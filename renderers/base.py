@@ -60,9 +60,7 @@ class BaseRenderer:
         else:
             plant, device, facing = None, driver, self.connect(setup, driver)
         check_driver(facing)
-        model = self.protected(scene.device_profile.limits, self.device_model(setup, facing))
-        bands = self.bands(setup, model)
-        model = self.limited(setup, model, bands)
+        model, bands = self.modelled(scene, setup, facing)
         design = partial(self.design, method, model, feedback=facing.sensed_channels > 0)
         return Rendering(
             scene=scene,
@@ -95,6 +93,13 @@ class BaseRenderer:
     def device_model(self, setup: Setup, driver: Driver) -> DeviceModel:
         """Return the device model of the device behind `driver`."""
         raise NotImplementedError
+
+    def modelled(self, scene: Scene, setup: Setup, driver: Driver, **changes: Any) -> tuple[DeviceModel, Bands]:
+        """Return the device model with its limits, some fields changed, and the bands; see the parts below."""
+        model = replace(self.device_model(setup, driver), **changes)
+        model = self.protected(scene.device_profile.limits, model)
+        bands = self.bands(setup, model)
+        return self.limited(setup, model, bands), bands
 
     def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
         """Return the device model with the limits of the device, whose drive is that of `model`; see `check_limits`."""

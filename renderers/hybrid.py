@@ -27,10 +27,9 @@ from hapticrender.protocols import Array, Driver, Method, Sensed
 from hapticrender.renderers.base import BaseRenderer
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
-from hapticrender.renderers.limits import check_carriers, perceptible
+from hapticrender.renderers.limits import perceptible
 from hapticrender.renderers.shaped import Port, WrappedDriver
 from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
-from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.scene import Scene, scene_keys
 
 BOTH = "rate"  # the parameter that plate and screen share
@@ -164,38 +163,32 @@ class HybridRenderer(BaseRenderer):
         """Return the square root for the screen's share of the scene."""
         return None if setup.friction is None else setup.friction.compensation
 
-    def device_model(self, setup: HybridSetup, driver: Driver) -> CombinedModel:
-        """Return the device models of the two parts behind `driver`."""
-        plate = self._plate.device_model(setup.plate, _part_of(driver, COILS, SENSORS, "plate"))
-        if setup.friction is None:
-            return _side_by_side(plate, None, setup.velocity_per_force)
-        friction = self._screen.device_model(setup.friction, _part_of(driver, 1, 1, "screen"))
-        if (setup.bands.wavenumber > 0.0).any():  # fixed carriers keep their share
-            start = setup.settings.start
-            plate = replace(plate, highest_frequency=start, highest_edge=2.0)
-            friction = replace(friction, lowest_frequency=2 * start)
-        return _side_by_side(plate, friction, setup.velocity_per_force)
-
-    def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
-        """Return the device models with the limits on the plate."""
-        parts: Any = model
-        return replace(parts, plate=self._plate.protected(limits, parts.plate))
-
-    def bands(self, setup: HybridSetup, model: DeviceModel) -> CombinedBands:
-        """Carriers and targets of a scene, shared out; refused where a part cannot do its share."""
-        bands = setup.bands
-        check_carriers(setup.scene, model, bands)
-        require(isinstance(model, CombinedModel), "model", model, "the CombinedModel of device_model", TypeError)
-        if len(bands.plate) or bands.plate.envelope is None:
-            bands = replace(bands, plate=self._plate.bands(setup.plate, model.plate))
-        if model.friction is not None and setup.friction is not None:
-            bands = replace(bands, friction=self._screen.bands(setup.friction, model.friction))
-        return bands
-
-    def limited(self, setup: HybridSetup, model: DeviceModel, bands: Bands) -> DeviceModel:
-        """Return the device model with the drive of the plate limited to what its share of the scene needs."""
-        parts: Any = model, bands
-        return replace(parts[0], plate=self._plate.limited(setup.plate, parts[0].plate, parts[1].plate))
+    def modelled(
+        self, scene: Scene, setup: HybridSetup, driver: Driver, **changes: Any
+    ) -> tuple[CombinedModel, CombinedBands]:
+        """Return device models and bands of both parts; what is judged is a velocity, which no sensor shows."""
+        port, start, friction = _part_of(driver, COILS, SENSORS, "plate"), setup.settings.start, None
+        moving = bool((setup.bands.wavenumber > 0.0).any())  # fixed carriers keep their share
+        low: dict[str, Any] = {"highest_frequency": start, "highest_edge": 2.0} if moving else {}
+        high = {"lowest_frequency": 2 * start} if moving else {}
+        plate, of_plate = self._plate.modelled(setup.plate.scene, setup.plate, port, **low)
+        bands = replace(setup.bands, plate=of_plate)
+        if setup.friction is not None:
+            port = _part_of(driver, 1, 1, "screen")
+            friction, of_friction = self._screen.modelled(setup.friction.scene, setup.friction, port, **high)
+            bands = replace(bands, friction=of_friction)
+        of_both: dict[str, Any] = {
+            "places": PLACES,
+            "shown": np.zeros((len(PLACES), SENSORS + 1)),
+            "lever_per_metre": 0.0,
+            "drive_limit": np.inf,
+            "sensed_limit": np.inf,
+            "highest_frequency": (friction or plate).highest_frequency,
+            "unit": "m/s",
+            "drive_unit": "A, A, N",
+        }
+        own: dict[str, Any] = {"plate": plate, "friction": friction, "velocity_per_force": setup.velocity_per_force}
+        return CombinedModel(**vars(plate) | of_both | own | changes), bands
 
     def design(self, method: Method, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> CombinedController:
         """Return two controllers of `method`, one a part, as one."""
@@ -263,19 +256,3 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str
             raise ValueError(f"{key}: belongs in [render]")
     check_names(values, known[0] | known[1])
     return [{names[key]: value for key, value in values.items() if key in names} for names in known]
-
-
-def _side_by_side(plate: DeviceModel, friction: DeviceModel | None, velocity_per_force: float) -> CombinedModel:
-    """Models of both; what is judged is a velocity, which no coordinate and no sensor of the plate shows."""
-    of_both: dict[str, Any] = {
-        "places": PLACES,
-        "shown": np.zeros((len(PLACES), SENSORS + 1)),
-        "lever_per_metre": 0.0,
-        "drive_limit": np.inf,
-        "sensed_limit": np.inf,
-        "highest_frequency": (friction or plate).highest_frequency,
-        "unit": "m/s",
-        "drive_unit": "A, A, N",
-    }
-    own: dict[str, Any] = {"plate": plate, "friction": friction, "velocity_per_force": velocity_per_force}
-    return CombinedModel(**vars(plate) | of_both | own)

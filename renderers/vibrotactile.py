@@ -87,7 +87,8 @@ class VibrotactileRenderer(BaseRenderer):
         scene = setup.scene
         bands = perceptible(scene, scene.texture.bands(model.rate), model)
         check_carriers(scene, model, bands)
-        check_targets(scene, model, bands, scene.texture.waveform)
+        if len(bands) or bands.envelope is None:  # of a hybrid's none may be the plate's
+            check_targets(scene, model, bands, scene.texture.waveform)
         return bands
 
     def limited(self, setup: PlateSetup, model: DeviceModel, bands: Bands) -> DeviceModel:

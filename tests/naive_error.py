@@ -248,7 +248,7 @@ class NaiveError:
             found = np.array([self.k, self.m, self.b])
             found += step * between(p["adaptation"], p["adaptation_high"], lively) * sums / total
             names = ("stiffness", "mass", "damping")
-            bounds = [[p[f"{which}_{name}"] for name in names] for which in ("least", "most")]
+            bounds = np.transpose([p[f"{name}_range"] for name in names])
             self.k, self.m, self.b = np.clip(found, *bounds)
 
     def limited(self, force):

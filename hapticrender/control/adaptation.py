@@ -6,7 +6,7 @@ one: neither delay nor observer closes a loop through the adaptation.  A step of
 """
 
 from hapticrender.control.laws import contact_damping
-from hapticrender.control.records import CONTROLLER_T, COORDINATE_T, PAIR_T, TILE_T, coordinates_of
+from hapticrender.control.records import COORDINATE_T, PAIR_T, TILE_T, coordinates_of
 from hapticrender.jit import kernel, record
 from hapticrender.vectors import conj, get, imag, maximum, pair, put, real, square, total, where, zeros
 
@@ -16,16 +16,14 @@ COMPLETE = 0.9  # of a carrier's own history, from which on its band counts
 
 
 @kernel
-def adaptation_step(controller):
+def adaptation_step(c):
     """Number of the step of adaptation."""
-    c = record(controller, CONTROLLER_T, 0)
     return c.sample // (1 if c.p.block > 1 else ADAPTATION_SAMPLES)
 
 
 @kernel
-def reset_finger(controller):
+def reset_finger(c):
     """Reset the finger estimate and the command history: contact has begun or ended."""
-    c = record(controller, CONTROLLER_T, 0)
     c.finger_mass = c.finger_damping = c.finger_stiffness = 0.0
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
@@ -35,7 +33,7 @@ def reset_finger(controller):
         put(b, "filtered_omega", get(b, "omega"))
         put(b, "complete", 1.0)
         for i in range(c.p.coordinates):
-            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            x = record(coordinates_of(c, t), COORDINATE_T, i)
             command = get(x, "v") + c.p.pattern[i] * get(b, "r")
             put(x, "last", get(x, "e") - get(x, "v"))
             put(x, "filtered", command)
@@ -46,15 +44,14 @@ def reset_finger(controller):
 
 
 @kernel
-def note_commands(controller):
+def note_commands(c):
     """Note what is commanded in this step, and the finger's part of the force."""
-    c = record(controller, CONTROLLER_T, 0)
     mass, damping, spring = c.finger_mass, c.finger_damping, c.finger_stiffness
-    first = adaptation_step(controller) % c.history * c.tiles
+    first = adaptation_step(c) % c.history * c.tiles
     for t in range(c.tiles):
         b, motion = record(c.tiles_at, TILE_T, t), pair(zeros(), zeros())
         for i in range(c.p.coordinates):
-            command = get(record(coordinates_of(controller, t), COORDINATE_T, i), "v") + c.p.pattern[i] * get(b, "r")
+            command = get(record(coordinates_of(c, t), COORDINATE_T, i), "v") + c.p.pattern[i] * get(b, "r")
             put(record(c.commands_at, PAIR_T, 3 * (first + t) + i), "z", command)
             motion = motion + (c.law_lever if i > 0 else 1.0) * command
         w = get(b, "omega")
@@ -69,9 +66,8 @@ def interpolated(a, b, share):
 
 
 @kernel
-def pool(controller, b, residual, motion, rest):
+def pool(c, b, residual, motion, rest):
     """Parts of a tile in stiffness, mass and damping, and weights |h X|^2/|D|^2; a band keeps what is left."""
-    c = record(controller, CONTROLLER_T, 0)
     p, w = c.p, get(b, "filtered_omega")
     w2, size2 = w * w, square(motion)
     spring2, mass2 = p.typical_stiffness * p.typical_stiffness, p.typical_mass * p.typical_mass
@@ -88,21 +84,20 @@ def pool(controller, b, residual, motion, rest):
 
 
 @kernel
-def commanded(controller, newer, older, share):
+def commanded(c, newer, older, share):
     """Command or finger's force between those of two numbers, `share` of the older one."""
-    at = record(controller, CONTROLLER_T, 0).commands_at
-    return interpolated(get(record(at, PAIR_T, newer), "z"), get(record(at, PAIR_T, older), "z"), share)
+    newest, oldest = record(c.commands_at, PAIR_T, newer), record(c.commands_at, PAIR_T, older)
+    return interpolated(get(newest, "z"), get(oldest, "z"), share)
 
 
 @kernel
-def adapt_finger(controller, observer, damper):
+def adapt_finger(c, observer, damper):
     """Take a step of adaptation: the finger's three numbers from the residual force of every band.
 
     Commands, the finger's force, reference and frequency are delayed and filtered alike, as the observer filters
     motion; the residual is pooled with weights |h X|^2/|D|^2, and a band keeps what is left.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    p, lag, number = c.p, contact_damping(controller), adaptation_step(controller)
+    p, lag, number = c.p, contact_damping(c), adaptation_step(c)
     samples, high = max(p.block, ADAPTATION_SAMPLES), max(c.fast_open, c.slow_open)
     rate = p.rate / samples
     gain = p.adaptation + high * (p.adaptation_high - p.adaptation)
@@ -127,12 +122,12 @@ def adapt_finger(controller, observer, damper):
         put(b, "complete", where(whole, complete + pole * (1.0 - complete), 0.0))
         put(b, "filtered_r", reference)
         put(b, "filtered_omega", w)
-        force = commanded(controller, newer + 3 * t + FORCE, older + 3 * t + FORCE, share)
+        force = commanded(c, newer + 3 * t + FORCE, older + 3 * t + FORCE, share)
         force = interpolated(get(b, "finger_force"), force, pole)
         put(b, "finger_force", force)
         for i in range(p.coordinates):  # of the heave row: D_a a + (D' + z' h) da/dt + j dw/dt m a
-            x, arm = record(coordinates_of(controller, t), COORDINATE_T, i), c.lever if i > 0 else 1.0
-            command = commanded(controller, newer + 3 * t + i, older + 3 * t + i, share)
+            x, arm = record(coordinates_of(c, t), COORDINATE_T, i), c.lever if i > 0 else 1.0
+            command = commanded(c, newer + 3 * t + i, older + 3 * t + i, share)
             command = interpolated(get(x, "filtered"), command, pole)
             moved = get(x, "e") + p.pattern[i] * reference
             a = moved - command
@@ -143,10 +138,10 @@ def adapt_finger(controller, observer, damper):
             force = force - (along + pair(damping + arm * c.finger_damping, 2.0 * mass * w) * slope)
             put(x, "filtered", command)
             put(x, "last", a)
-        part_k, part_m, part_b, weight = pool(controller, b, force, motion, rest)
+        part_k, part_m, part_b, weight = pool(c, b, force, motion, rest)
         sum_k, sum_m, sum_b, weights = sum_k + part_k, sum_m + part_m, sum_b + part_b, weights + weight
     weight = total(weights)
     step = gain / rate / (weight if weight > 0.0 else 1.0)
-    c.finger_stiffness = min(max(c.finger_stiffness + step * total(sum_k), p.least_stiffness), p.most_stiffness)
-    c.finger_mass = min(max(c.finger_mass - step * total(sum_m), p.least_mass), p.most_mass)
-    c.finger_damping = min(max(c.finger_damping + step * total(sum_b), p.least_damping), p.most_damping)
+    c.finger_stiffness = min(max(c.finger_stiffness + step * total(sum_k), p.stiffness_range[0]), p.stiffness_range[1])
+    c.finger_mass = min(max(c.finger_mass - step * total(sum_m), p.mass_range[0]), p.mass_range[1])
+    c.finger_damping = min(max(c.finger_damping + step * total(sum_b), p.damping_range[0]), p.damping_range[1])

@@ -8,7 +8,7 @@ from the finger's position in every sample.  With M samples a block the carrier 
 from numba import carray
 
 from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, TILE_T, WAVEFORM, W, samples_of
-from hapticrender.jit import C16, SIGNALS_T, entry, kernel, pointer, record
+from hapticrender.jit import C16, entry, kernel, pointer, record
 from hapticrender.mathx import TURN, smooth, unit
 from hapticrender.vectors import (
     get,
@@ -35,12 +35,11 @@ FASTEST = 10.0  # m/s: a finger that moves faster has been put down elsewhere
 
 
 @kernel
-def track_finger(controller, position):
+def track_finger(c, position):
     """Update the finger's position, velocity and acceleration: an observer with a triple pole; NaN means lifted.
 
     The last velocity is held until the next touch, so that a target along the surface fades out where it was.
     """
-    c = record(controller, CONTROLLER_T, 0)
     period = 1.0 / c.p.rate
     pole = TRACKER_POLE * period
     leapt = c.finger_seen > 0.0 and abs(position - c.held_position) * c.p.rate > FASTEST
@@ -70,7 +69,7 @@ def predict_positions(tracker, positions, ahead, predicted):
     """Extrapolate positions (m, NaN while lifted, where the last prediction holds) by `ahead` samples, causally."""
     c = record(tracker, CONTROLLER_T, 0)
     for n in range(len(positions)):
-        track_finger(tracker, positions[n])
+        track_finger(c, positions[n])
         if c.finger_seen > 0.0:
             time = ahead / c.p.rate
             c.held_prediction = positions[n] + time * (c.velocity + 0.5 * time * c.acceleration)
@@ -78,9 +77,8 @@ def predict_positions(tracker, positions, ahead, predicted):
 
 
 @kernel
-def take_setpoints(controller):
+def take_setpoints(c):
     """Read the setpoints into the tiles; tables and law are marked stale where a carrier is another one."""
-    c = record(controller, CONTROLLER_T, 0)
     p, row = c.p, 8 * W * c.tiles
     c.locked = 0
     for t in range(c.tiles):
@@ -106,9 +104,8 @@ def take_setpoints(controller):
 
 
 @kernel
-def fade_fixed(controller, t):
+def fade_fixed(c, t):
     """Fade the targets of fixed carriers in."""
-    c = record(controller, CONTROLLER_T, 0)
     b, active = record(c.tiles_at, TILE_T, t), get(record(c.tiles_at, TILE_T, t), "active")
     fade = minimum(get(b, "fade") + c.p.fade_in * c.p.block, 1.0)
     put(b, "fade", fade)
@@ -118,24 +115,22 @@ def fade_fixed(controller, t):
 
 
 @kernel
-def contact_lag(controller):
+def contact_lag(c):
     """Time (s) by which friction follows drive or sensors: the contact's length over the finger's speed.
 
     The speed is that of Brown's double smoothing, without lag under constant acceleration.
     """
-    c = record(controller, CONTROLLER_T, 0)
     speed = max(2.0 * c.speed - c.smooth_speed, SLOWEST * c.p.typical_speed)
     return c.p.contact_lag / speed if c.p.contact_lag > 0.0 else 0.0
 
 
 @kernel
-def fade_locked(controller, t):
+def fade_locked(c, t):
     """Update frequency, sweep and weights of a tile whose carriers follow the finger, and what its sensor shows.
 
     A target fades in with contact (and with speed, where friction needs it), and out towards the ends of the device's
     range; the feedback's weight stays until the last quadrature of it.
     """
-    c = record(controller, CONTROLLER_T, 0)
     b, p = record(c.tiles_at, TILE_T, t), c.p
     step, always = p.fade_in * p.block, p.needs_contact == 0.0
     touching = c.finger_seen > 0.0 and (always or c.speed >= p.least_speed)
@@ -152,24 +147,22 @@ def fade_locked(controller, t):
     put(b, "weight", weight * where(follows, smooth(left / (p.highest_edge - 1.0)), 1.0))
     put(b, "feedback", minimum(weight * where(follows, smooth(4.0 * left), 1.0) / maximum(fade, 1e-9), 1.0))
     if p.corrected > 0.0:  # before the contact's lag, and delayed
-        put(b, "response", unit((-p.sensor_delay / TURN) * omega) * pair(1.0, contact_lag(controller) * omega))
+        put(b, "response", unit((-p.sensor_delay / TURN) * omega) * pair(1.0, contact_lag(c) * omega))
 
 
 @kernel
-def crowding(controller):
+def crowding(c):
     """Factor on the observer's gain under a slow finger, whose carriers lie close together."""
-    c = record(controller, CONTROLLER_T, 0)
     return min(abs(c.velocity) / c.p.crowd_speed, 1.0) if c.p.crowd_speed > 0.0 else 1.0
 
 
 @kernel
-def advance_carriers(controller):
+def advance_carriers(c):
     """Carriers and weights of all tiles for a block: setpoints, finger, phases, fades."""
-    c = record(controller, CONTROLLER_T, 0)
     block, rate = c.p.block, c.p.rate
     refresh, ahead = block > 1 or c.sample % REFRESH == 0, float(block if block > 1 else REFRESH)
     if refresh:
-        take_setpoints(controller)
+        take_setpoints(c)
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         mode = b.mode[0]
@@ -183,9 +176,9 @@ def advance_carriers(controller):
         else:
             put(b, "carrier", get(b, "carrier") * get(b, "turn"))
         if mode == LOCKED:
-            fade_locked(controller, t)
+            fade_locked(c, t)
         elif mode == FADING:
-            fade_fixed(controller, t)
+            fade_fixed(c, t)
         elif refresh:
             put(b, "slope", 0.0)
             put(b, "expected", get(b, "r"))
@@ -193,17 +186,16 @@ def advance_carriers(controller):
 
 
 @kernel
-def update_targets(controller, signals, first):
+def update_targets(c, io, first):
     """Targets, references R and their slopes for a block, and a row of the log.
 
     A target is the setpoint times its weight, or follows the envelope that the waveform was found to have, at the
     observer's pace; both differentiated for a texture in velocity.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    p, io = c.p, record(signals, SIGNALS_T, 0)
-    rate, row, crowded_gain = p.rate / p.block, first // p.block, crowding(controller) if p.block == 1 else 1.0
+    p = c.p
+    rate, row, crowded_gain = p.rate / p.block, first // p.block, crowding(c) if p.block == 1 else 1.0
     follow = min(0.5 * crowded_gain * p.waveform_gain * p.block, 1.0)
-    factor = samples_of(controller)[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0
+    factor = samples_of(c)[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0
     log = carray(pointer(io.target, C16), (row + 1, c.bands))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)

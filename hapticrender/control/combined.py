@@ -47,7 +47,6 @@ PART = np.dtype(
         ("scale_waveform", np.float64),  # of the part per waveform of both
         ("heat", np.float64, (MOST_CHANNELS,)),  # of a part without target: means of the squares of its drives,
         ("heat_decay", np.float64),  # and the share of them that a block leaves
-        *((f"{name}_at", np.int64) for name in ("sensed", "drive", "waveform", "target", "flags", "position")),
     ]
 )
 COMBINED = np.dtype([*((name, np.int64) for name in ("bands", "channels", "sensors", "block")), ("parts", PART, (2,))])
@@ -60,8 +59,7 @@ def combined_step(state, signals, start, count):
     c, io = record(state, COMBINED_T, 0), record(signals, SIGNALS_T, 0)
     block, stop = c.block, start + count
     sensed, drive = carray(pointer(io.sensed, F8), (stop, c.sensors)), carray(pointer(io.drive, F8), (stop, c.channels))
-    position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
-    target, flags = carray(pointer(io.target, C16), (stop // block, c.bands)), carray(pointer(io.flags, I8), stop)
+    waveform, target = carray(pointer(io.waveform, F8), stop), carray(pointer(io.target, C16), (stop // block, c.bands))
     for first in range(start, stop, block):
         sensor = channel = 0
         row = first // block
@@ -69,25 +67,23 @@ def combined_step(state, signals, start, count):
             target[row, k] = 0.0
         for i in range(2):
             p = c.parts[i]
-            own, out = (
-                carray(pointer(p.sensed_at, F8), (block, p.sensors)),
-                carray(pointer(p.drive_at, F8), (block, p.channels)),
-            )
-            place, part_waveform = carray(pointer(p.position_at, F8), block), carray(pointer(p.waveform_at, F8), block)
-            goal, raised = carray(pointer(p.target_at, C16), (1, p.bands)), carray(pointer(p.flags_at, I8), block)
-            index = carray(pointer(p.index, I8), p.bands)
+            own = record(p.signals, SIGNALS_T, 0)
+            part_sensed = carray(pointer(own.sensed, F8), (block, p.sensors))
+            part_drive = carray(pointer(own.drive, F8), (block, p.channels))
+            goal, index = carray(pointer(own.target, C16), (1, p.bands)), carray(pointer(p.index, I8), p.bands)
+            part_waveform = carray(pointer(own.waveform, F8), block)
+            own.position, own.flags = io.position + 8 * first, io.flags + 8 * first
             for m in range(block):
                 for s in range(p.sensors):
-                    own[m, s] = sensed[first + m, sensor + s]
-                place[m], part_waveform[m], raised[m] = position[first + m], p.scale_waveform * waveform[first + m], 0
+                    part_sensed[m, s] = sensed[first + m, sensor + s]
+                part_waveform[m] = p.scale_waveform * waveform[first + m]
             if p.step != 0:
                 call(p.step, (p.state, p.signals, 0, block))
             for k in range(MOST_CHANNELS):
                 p.heat[k] *= p.heat_decay
             for m in range(block):
                 for k in range(p.channels):
-                    drive[first + m, channel + k] = out[m, k]
-                flags[first + m] |= raised[m]
+                    drive[first + m, channel + k] = part_drive[m, k]
             for k in range(p.bands):
                 scale = p.scale
                 if scale == 0.0:
@@ -130,15 +126,13 @@ class CombinedController(Addressed):
                 "drive": np.zeros((self.block, channels[i])),
                 "waveform": np.zeros(self.block),
                 "target": np.zeros((1, count), complex),
-                "flags": np.zeros(self.block, np.int64),
-                "position": np.zeros(self.block),
             }
             signals = addresses(**arrays)
             self._buffers += [*arrays.values(), indices[i], signals]
-            values: dict[str, Any] = {f"{name}_at": array for name, array in arrays.items()}
+            values: dict[str, Any] = {}
             if part is not None:
                 bank = getattr(part, "controller", part)
-                values |= {"step": part.step.address, "state": part.state, "bank": bank.state}
+                values = {"step": part.step.address, "state": part.state, "bank": bank.state}
             own = record_of(
                 PART,
                 **values,

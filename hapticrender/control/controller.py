@@ -12,6 +12,7 @@ from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.records import (
     CONTROLLER,
     FADING,
+    LOW_PASS,
     MOST_CHANNELS,
     MOST_SENSORS,
     PAIR,
@@ -60,14 +61,17 @@ class BankController(Addressed):
         tiles = max(-(-self.n_bands // W), 1)
         self.tiles = aligned(tiles, TILE)
         self.tiles["mode"] = FADING
-        self.tiles["turn_re"] = 1.0
+        self.tiles["turn_re"] = self.tiles["r_phasor_re"] = self.tiles["omega_sign"] = 1.0
         self.tiles["active"] = (np.arange(tiles * W) < self.n_bands).reshape(tiles, W)
         self.setpoints = setpoint_rows(bands)
         most = min(max(int(LONGEST_GROUP * self.rate), 1), LARGEST_GROUP)
         group = min(most, self.block)
         groups = -(-self.block // group)  # the last one may be filled in part
+        loops = int(settings["coordinates"]) * tiles
         memory = {
             "tiles": self.tiles,
+            "loops": aligned(loops, LOW_PASS),
+            "window": aligned((int(settings.get("window", 0)), loops), PAIR),
             "commands": aligned(history * tiles * 3, PAIR),  # of both coordinates; the finger's force
             "setpoints": self.setpoints,
             "work": aligned(2 * tiles, WORK),

@@ -144,7 +144,6 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> di
     wait = model.delay * period  # integrator, observer and delay leave at least PHASE_MARGIN
     fastest = [min(2 * math.pi * lowest / 4, PHASE_MARGIN / (wait + 1 / each)) for each in pole]
     dc = 2 * math.pi * min(6.0, lowest / rules.dc) * period
-    ridges = ridge_spacing(bands)
     on = 1.0 if feedback else 0.0
     return {
         "observer": on * 2 * pole[0] * period,
@@ -156,7 +155,7 @@ def _gains(model: DeviceModel, bands: Bands, rules: Rules, feedback: bool) -> di
         "dc_drift": on * dc**2,
         "damper": rules.damper[0],
         "damper_high": rules.damper[1],
-        "crowd_speed": max(pole) / ridges if math.isfinite(ridges) else 0.0,
+        "crowd_speed": max(pole) / ridge_spacing(bands),
     }
 
 
@@ -223,14 +222,10 @@ def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
     }
 
 
-def _finger(finger: FingerRange) -> dict[str, float]:
+def _finger(finger: FingerRange) -> dict[str, Any]:
     """How contact is detected, and what may be estimated of it."""
     on, off = finger.contact or (ALWAYS, ALWAYS)
-    bounds = {
-        f"{which}_{name}": getattr(finger, name)[i]
-        for name in ("mass", "damping", "stiffness")
-        for i, which in enumerate(("least", "most"))
-    }
+    bounds = {f"{name}_range": getattr(finger, name) for name in ("mass", "damping", "stiffness")}
     typical = {name: getattr(finger, name) for name in ("least_motion", "typical_mass", "typical_stiffness")}
     return {"contact_on": on, "contact_off": off, **typical, **bounds}
 

@@ -150,13 +150,9 @@ class Demodulator:
         count = -(-frequency.size // W)
         step = np.zeros((count, W))
         step.reshape(-1)[: frequency.size] = frequency / rate
-        self._tiles = aligned(self.channels * count, TILE)
-        for name, value in (
-            ("step", step),
-            ("turn_re", np.cos(2 * np.pi * step)),
-            ("turn_im", np.sin(2 * np.pi * step)),
-        ):
-            self._tiles[name] = np.tile(value, (self.channels, 1))
+        self._tiles = aligned((self.channels, count), TILE)
+        self._tiles["step"], turn = step, 2 * np.pi * step
+        self._tiles["turn_re"], self._tiles["turn_im"] = np.cos(turn), np.sin(turn)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Take the state of the one that this is a copy of, in memory of its own that is aligned, too."""

@@ -57,7 +57,7 @@ GAINS = np.dtype(
         *((name, np.int64) for name in ("left", "watched")),  # samples: to go in the trial; with actuators followed
     ]
 )
-"""Settings and state of the tests of gains."""
+"""Settings and state of the tests of gains; kernels take it as `s`, by reference."""
 GAINS_T = numba.from_dtype(GAINS)
 
 
@@ -108,9 +108,8 @@ def _filter(a: Array, c: Array, wander: float) -> tuple[Array, float]:
 
 
 @kernel
-def advance_model(gains, k, force0, force1):
+def advance_model(s, k, force0, force1):
     """Advance model k by a sample, under the force that acts."""
-    s = record(gains, GAINS_T, 0)
     x, a, b = s.models[k], s.step_state, s.step_force
     force0, force1 = force0 + x[4], force1 + x[5]
     x0, x1, x2, x3 = x[0], x[1], x[2], x[3]
@@ -119,25 +118,22 @@ def advance_model(gains, k, force0, force1):
 
 
 @kernel
-def correct_model(gains, k, error0, error1):
+def correct_model(s, k, error0, error1):
     """Correct model k by the innovations of both sensors."""
-    s = record(gains, GAINS_T, 0)
     for i in range(6):
         s.models[k, i] += s.filter_gain[i, 0] * error0 + s.filter_gain[i, 1] * error1
 
 
 @kernel
-def model_sensors(gains, k):
+def model_sensors(s, k):
     """What both sensors show of model k, over their noise."""
-    s = record(gains, GAINS_T, 0)
     c, heave, rocking = s.sensor_from_coordinate, s.models[k, 0], s.models[k, 1]
     return c[0, 0] * heave + c[0, 1] * rocking, c[1, 0] * heave + c[1, 1] * rocking
 
 
 @kernel
-def clear_sums(gains, kind):
+def clear_sums(s, kind):
     """Set the sums of a kind of gains, and the models behind its w, to zero."""
-    s = record(gains, GAINS_T, 0)
     for j in range(CHANGES):
         s.weighted[kind, j] = 0.0
         for i in range(CHANGES):
@@ -147,9 +143,8 @@ def clear_sums(gains, kind):
 
 
 @kernel
-def add_sums(gains, kind, pole):
+def add_sums(s, kind, pole):
     """Add a sample of w to the sums; with a `pole` below 1 these are means."""
-    s = record(gains, GAINS_T, 0)
     w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - pole
     for i in range(CHANGES):
         for j in range(i, CHANGES):
@@ -166,12 +161,11 @@ def is_fault(kind, gain, rest):
 
 
 @kernel
-def judge_gains(gains, kind, noise):
+def judge_gains(s, kind, noise):
     """Find gains and swap, from innovations of variance `noise`: gains that are faults, as bits; whether it is a swap.
 
     A swap has to explain more than the gains do, where these are faults.
     """
-    s = record(gains, GAINS_T, 0)
     w, b, energy, faults = s.weights[kind], s.weighted[kind], s.energy[kind], 0
     w00, w11, w22 = w[0, 0] + noise, w[1, 1] + noise, w[SWAP, SWAP] + noise  # what shows nothing keeps its gain
     scale = 1.0 / (w00 * w11 - w[0, 1] * w[0, 1])
@@ -196,47 +190,44 @@ def judge_gains(gains, kind, noise):
 
 
 @kernel
-def follow_sensors(gains, force0, force1):
+def follow_sensors(s, force0, force1):
     """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they are swapped."""
-    s = record(gains, GAINS_T, 0)
-    p0, p1 = model_sensors(gains, MOTION)
+    p0, p1 = model_sensors(s, MOTION)
     for j in range(CHANGES):
-        known0, known1 = model_sensors(gains, RESPONSE + j)
+        known0, known1 = model_sensors(s, RESPONSE + j)
         s.w[j, 0] = (p0 if j == 0 else p1 - p0 if j == SWAP else 0.0) - known0
         s.w[j, 1] = (p1 if j == 1 else p0 - p1 if j == SWAP else 0.0) - known1
-    add_sums(gains, SENSOR, 1.0)
+    add_sums(s, SENSOR, 1.0)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
-    advance_model(gains, MOTION, force0, force1)
+    advance_model(s, MOTION, force0, force1)
     for j in range(CHANGES):
-        correct_model(gains, RESPONSE + j, s.w[j, 0], s.w[j, 1])
-        advance_model(gains, RESPONSE + j, 0.0, 0.0)
+        correct_model(s, RESPONSE + j, s.w[j, 0], s.w[j, 1])
+        advance_model(s, RESPONSE + j, 0.0, 0.0)
     s.left -= 1
-    return judge_gains(gains, SENSOR, s.innovation) if s.left == 0 else (0, False)
+    return judge_gains(s, SENSOR, s.innovation) if s.left == 0 else (0, False)
 
 
 @kernel
-def follow_actuators(gains, force0, force1):
+def follow_actuators(s, force0, force1):
     """Add a sample to the means; the actuators that are inverted, as bits, and whether they are swapped."""
-    s = record(gains, GAINS_T, 0)
     first = RESPONSE + CHANGES * ACTUATOR
     for j in range(CHANGES):
-        s.w[j, 0], s.w[j, 1] = model_sensors(gains, first + j)
+        s.w[j, 0], s.w[j, 1] = model_sensors(s, first + j)
     if s.watched > s.duration // 2:  # by then w no longer depends on where it began
-        add_sums(gains, ACTUATOR, s.window_pole)
+        add_sums(s, ACTUATOR, s.window_pole)
     for j in range(CHANGES):
         f = s.force_of_actuator[j]
-        correct_model(gains, first + j, -s.w[j, 0], -s.w[j, 1])
-        advance_model(gains, first + j, f[0, 0] * force0 + f[0, 1] * force1, f[1, 0] * force0 + f[1, 1] * force1)
+        correct_model(s, first + j, -s.w[j, 0], -s.w[j, 1])
+        advance_model(s, first + j, f[0, 0] * force0 + f[0, 1] * force1, f[1, 0] * force0 + f[1, 1] * force1)
     known = 2 * s.watched > 3 * s.duration and s.energy[ACTUATOR] > LARGE * s.innovation
-    return judge_gains(gains, ACTUATOR, s.window_pole * s.innovation) if known else (0, False)
+    return judge_gains(s, ACTUATOR, s.window_pole * s.innovation) if known else (0, False)
 
 
 @kernel
-def note_innovations(gains, sensed, sensors):
+def note_innovations(s, sensed, sensors):
     """Find the innovations and their mean squares; whether one has jumped."""
-    s = record(gains, GAINS_T, 0)
     jump, energy = False, 0.0
-    known0, known1 = model_sensors(gains, STATE)
+    known0, known1 = model_sensors(s, STATE)
     for i in range(sensors):
         s.e[i] = s.scale * sensed[i] - (known0 if i == 0 else known1)
         square = s.e[i] * s.e[i]
@@ -256,21 +247,21 @@ def check_gains(gains, sensed, sensors, force0, force1):
     s = record(gains, GAINS_T, 0)
     sensor_faults = actuator_faults = 0
     sensors_swapped = actuators_swapped = False
-    if note_innovations(gains, sensed, sensors) and s.left == 0:
-        clear_sums(gains, SENSOR)
+    if note_innovations(s, sensed, sensors) and s.left == 0:
+        clear_sums(s, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):
             s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
-        sensor_faults, sensors_swapped = follow_sensors(gains, force0, force1)
+        sensor_faults, sensors_swapped = follow_sensors(s, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        actuator_faults, actuators_swapped = follow_actuators(gains, force0, force1)
+        actuator_faults, actuators_swapped = follow_actuators(s, force0, force1)
     elif s.watched > 0:
-        clear_sums(gains, ACTUATOR)
+        clear_sums(s, ACTUATOR)
         s.watched = 0
-    correct_model(gains, STATE, s.e[0], s.e[1])
-    advance_model(gains, STATE, force0, force1)
+    correct_model(s, STATE, s.e[0], s.e[1])
+    advance_model(s, STATE, force0, force1)
     return sensor_faults, actuator_faults, sensors == MOST and (sensors_swapped or actuators_swapped)
 
 

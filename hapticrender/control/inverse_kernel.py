@@ -90,7 +90,7 @@ def take_reference(controller, inverse, waveform):
     for i in range(TAPS - 1):
         window[i], expected[i] = window[i + 1], expected[i + 1]
     window[TAPS - 1], expected[TAPS - 1], ring[at] = value, ring[at], value
-    v.reference, lag = 0.0, contact_lag(controller)
+    v.reference, lag = 0.0, contact_lag(c)
     for i in range(TAPS):
         v.reference += (v.sensor_filter[i] + lag * v.sensor_rate_filter[i]) * expected[i]
 
@@ -98,7 +98,7 @@ def take_reference(controller, inverse, waveform):
 @kernel
 def find_basis(controller, inverse):
     """Basis of the forces at the moment at which this sample's drive acts: derivatives of r by the filters."""
-    v = record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     window, filters, basis, poles, pair = v.window, v.filters, v.basis, v.poles, v.pole_step
     d0 = d1 = d2 = d3 = 0.0
     for i in range(TAPS):
@@ -106,7 +106,7 @@ def find_basis(controller, inverse):
         d1 += filters[1, i] * window[i]
         d2 += filters[2, i] * window[i]
         d3 += filters[3, i] * window[i]
-    lag = contact_lag(controller)  # what has to be made is r + lag r', for the contact to follow r
+    lag = contact_lag(c)  # what has to be made is r + lag r', for the contact to follow r
     d0, d1, d2 = d0 + lag * d1, d1 + lag * d2, d2 + lag * d3
     last = basis[0]
     first = pair[0, 0] * poles[0] + pair[0, 1] * poles[1] + pair[0, 2] * last + pair[0, 3] * d0
@@ -115,8 +115,7 @@ def find_basis(controller, inverse):
     w = v.omega_n
     basis[0], basis[1], basis[2] = d0, d1 / w, d2 / (w * w)
     basis[3], basis[4] = v.pole * v.pole * first, v.pole * poles[1]
-    rate = record(controller, CONTROLLER_T, 0).p.rate
-    basis[5] = (v.mass[0, 0] * d3 + v.damping[0, 0] * d2 + v.stiffness[0, 0] * d1) / rate
+    basis[5] = (v.mass[0, 0] * d3 + v.damping[0, 0] * d2 + v.stiffness[0, 0] * d1) / c.p.rate
     return d1, d2
 
 
@@ -231,12 +230,12 @@ def recover(controller, inverse):
 def play(controller, inverse, drive, flags, n, nominal0, nominal1):
     """Write the drive of a sample; what of it is not the nominal force goes into the ring with the basis."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    samples, limit, basis = samples_of(controller), c.p.drive_limit, v.basis
+    samples, limit, basis = samples_of(c), c.p.drive_limit, v.basis
     ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
     at = v.sample % (v.delay + 1)
     played0 = played1 = most = 0.0
     for i in range(c.p.channels):
-        exact = c.confidence * drive_of(controller, samples, Y, 0, i)
+        exact = c.confidence * drive_of(c, samples, Y, 0, i)
         if not abs(exact) < HUGE:
             exact = 0.0
             flags[n] |= NONFINITE
@@ -245,7 +244,7 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
         if c.confidence == 0.0:
             c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
         elif c.p.drive_step > 0.0:
-            exact = shape_noise(controller, exact, i)
+            exact = shape_noise(c, exact, i)
         value = min(max(exact, -limit), limit)
         drive[n, i] = value
         played0 += v.force_from_drive[0, i] * value
@@ -264,25 +263,25 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
 def inverse_step(state, signals, start, count):
     """Advance the waveform law by `count` samples; see `hapticrender.jit`."""
     c, io = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0)
-    inverse, samples, stop = c.loops_at, samples_of(state), start + count
+    inverse, samples, stop = c.loops_at, samples_of(c), start + count
     v = record(inverse, INVERSE_T, 0)
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
-        implausible = sense_block(state, signals, n)
+        implausible = sense_block(c, io, n)
         if c.locked == 0:
-            track_finger(state, position[n])
+            track_finger(c, position[n])
         y0, y1 = samples[Y, 0], samples[Y + 1, 0]
         if c.bands > 0:
-            advance_carriers(state)
-            update_targets(state, signals, n)
+            advance_carriers(c)
+            update_targets(c, io, n)
         else:
             c.sample += 1
         learning = follow_contact(state, inverse)
         take_reference(state, inverse, waveform[n] if c.p.reads_waveform > 0.0 else 0.0)
         error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
         samples[Y, 0] = samples[Y + 1, 0] = 0.0  # from here on forces: the damper's first
-        if update_confidence(state, implausible):
+        if update_confidence(c, implausible):
             reset_parameters(inverse, FINGER, PARAMETERS)
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place

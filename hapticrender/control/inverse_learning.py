@@ -46,8 +46,8 @@ def discretise(controller, inverse):
     The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave and coupling:
     springs and dampers at the two sides change rocking by as much as heave, and couple both by their difference.
     """
-    v = record(inverse, INVERSE_T, 0)
-    theta, w, period = v.theta, TURN * 180.0, 1.0 / record(controller, CONTROLLER_T, 0).p.rate
+    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    theta, w, period = v.theta, TURN * 180.0, 1.0 / c.p.rate
     turn, pole = w / v.omega_n, v.pole
     low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
     z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
@@ -55,7 +55,7 @@ def discretise(controller, inverse):
     mass = min(max(-z.real / (w * w), -min(2e-3, 0.2 * v.mass[0, 0])), 10e-3) * v.contact
     damping = min(max(z.imag / w, 0.0), 12.0) * v.contact
     h, per_c, per_m = v.lever, 1.0 / v.omega_n, 1.0 / (v.omega_n * v.omega_n)
-    lag = v.behind * contact_lag(controller)
+    lag = v.behind * contact_lag(c)
     k00 = corrected(v.stiffness[0, 0], theta[HEAVE])
     m00 = corrected(v.mass[0, 0] + lag * v.damping[0, 0], per_m * theta[HEAVE + 2]) + mass
     m01 = v.mass[0, 1] + coupled(v.mass[1, 1], per_m * theta[COUPLING + 2]) + h * mass

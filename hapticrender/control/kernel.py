@@ -52,15 +52,13 @@ CONFIDENCE_FADE = 0.02  # s: within this the drive fades out while a sensor's sa
 
 
 @kernel
-def sense_block(controller, signals, first):
+def sense_block(c, io, first):
     """Convert the block's sensors to coordinates; returns 1 where a sensor's sample is invalid.
 
     That is one that is not finite, or not inside the sensor's range: its coordinates are NaN, and the innovation takes
     the prediction in their place.  It is flagged, as a position or a waveform that is no number is.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    io, samples = record(signals, SIGNALS_T, 0), samples_of(controller)
-    p, block = c.p, c.p.block
+    samples, p, block = samples_of(c), c.p, c.p.block
     sensed, flags = pointer(io.sensed, F8), pointer(io.flags, I8)
     position, waveform = pointer(io.position, F8), pointer(io.waveform, F8)
     reads, implausible = p.reads_waveform > 0.0 or p.modulated > 0.0, 0
@@ -84,59 +82,55 @@ def sense_block(controller, signals, first):
         if raised > 0 or abs(position[n]) > FARTHEST or not sane:
             flags[n] |= raised | NONFINITE
         if c.locked > 0:
-            track_finger(controller, position[n])
+            track_finger(c, position[n])
         samples[POSITION, m] = c.held_position
     return implausible
 
 
 @kernel
-def update_confidence(controller, implausible):
+def update_confidence(c, implausible):
     """Fade the confidence in the sensors out within 20 ms while samples are implausible, and in again; True at none."""
-    c = record(controller, CONTROLLER_T, 0)
     change = c.p.block / (CONFIDENCE_FADE * c.p.rate)
     c.confidence = max(c.confidence - change, 0.0) if implausible > 0 else min(c.confidence + change, 1.0)
     return c.confidence == 0.0
 
 
 @kernel
-def analyse_sample(controller):
+def analyse_sample(c):
     """Update the envelopes of the target's waveform by the residual observer."""
-    c = record(controller, CONTROLLER_T, 0)
     found = zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         found = found + real(get(b, "raw") * get(b, "carrier"))
-    gain = c.p.waveform_gain * crowding(controller) * (samples_of(controller)[WAVEFORM, 0] - total(found))
+    gain = c.p.waveform_gain * crowding(c) * (samples_of(c)[WAVEFORM, 0] - total(found))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         put(b, "raw", get(b, "raw") + gain * conj(get(b, "carrier")))
 
 
 @kernel
-def analyse_block(controller):
+def analyse_block(c):
     """Update the envelopes of the target's waveform as exactly as those of the sensors."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples = samples_of(controller)
+    samples = samples_of(c)
     for t in range(c.tiles):
         b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, 2 * t)
         put(w, "x", get(b, "raw") * get(b, "carrier"))
-    sum_bands(controller, 1, False)
+    sum_bands(c, 1, False)
     for m in range(c.p.block):
         samples[WAVEFORM, m] -= samples[SUM, m]
-    solve(controller, WAVEFORM, ANALYSIS)
-    correlate(controller, WAVEFORM, 1)
+    solve(c, WAVEFORM, ANALYSIS)
+    correlate(c, WAVEFORM, 1)
     for t in range(c.tiles):
         b, w = record(c.tiles_at, TILE_T, t), record(c.work_at, WORK_T, 2 * t)
         put(b, "raw", get(b, "raw") + c.p.waveform_gain * conj(get(w, "x") * get(b, "carrier")))
 
 
 @kernel
-def predict(controller, i):
+def predict(c, i):
     """Sums over the bands of a coordinate: what the sensors should show, and the commanded motion."""
-    c = record(controller, CONTROLLER_T, 0)
     shown, command = zeros(), zeros()
     for t in range(c.tiles):
-        b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(controller, t), COORDINATE_T, i)
+        b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(c, t), COORDINATE_T, i)
         carrier = get(b, "carrier")
         reference = c.p.pattern[i] * real(get(b, "r") * carrier)
         shown = shown + (reference + real(get(x, "e") * carrier))
@@ -145,18 +139,15 @@ def predict(controller, i):
 
 
 @kernel
-def innovate_sample(controller):
+def innovate_sample(c):
     """Innovation of a sample, DC estimates of type 2, and the inner damper's force into the row STEP.
 
     The damper is F = -sum c_j dev[n - j], `damper_force` before its gain; `past` is a ring of deviations from the
     command.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    samples, now, p = samples_of(controller), c.sample & PAST_MASK, c.p
-    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
+    samples, now, p = samples_of(c), c.sample & PAST_MASK, c.p
     for i in range(p.coordinates):
-        shown, command = predict(controller, i)
+        shown, command = predict(c, i)
         if samples[Y + i, 0] != samples[Y + i, 0]:  # invalid: hold the prediction
             samples[Y + i, 0] = shown + c.dc[i]
         deviation = samples[Y + i, 0] - c.scale * command
@@ -168,38 +159,33 @@ def innovate_sample(controller):
         c.damper_force[i], samples[STEP + i, 0] = force, c.damping_gain * force
         error = samples[Y + i, 0] - shown - c.dc[i]
         samples[Y + i, 0] = error
-        c.dc[i] += c.dc_drift[i] + gain * error
-        c.dc_drift[i] += drift * error
+        c.dc[i] += c.dc_drift[i] + c.dc_gain * error
+        c.dc_drift[i] += c.dc_drift_gain * error
 
 
 @kernel
-def innovate_block(controller):
+def innovate_block(c):
     """Innovations of every sample of a block, solved exactly; the DC estimates of type 2 after it; correlations x."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, block, p = samples_of(controller), c.p.block, c.p
+    samples, block, p = samples_of(c), c.p.block, c.p
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         for i in range(p.coordinates):
-            envelope = p.pattern[i] * get(b, "expected") + get(
-                record(coordinates_of(controller, t), COORDINATE_T, i), "e"
-            )
+            envelope = p.pattern[i] * get(b, "expected") + get(record(coordinates_of(c, t), COORDINATE_T, i), "e")
             put(record(c.work_at, WORK_T, 2 * t + i), "x", envelope * get(b, "carrier"))
-    sum_bands(controller, p.coordinates, False)
-    gain = p.dc_fast if c.dc_fast_on > 0.0 else p.dc
-    drift = p.dc_drift_fast if c.dc_fast_on > 0.0 else p.dc_drift
+    sum_bands(c, p.coordinates, False)
     for i in range(p.coordinates):
         for m in range(block):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
             if samples[Y + i, m] != samples[Y + i, m]:  # invalid: hold the prediction
                 samples[Y + i, m] = 0.0
-        solve(controller, Y + i, INVERSE)
+        solve(c, Y + i, INVERSE)
         gained = steeper = 0.0
         for m in range(block):
-            gained += (gain + (block - 1 - m) * drift) * samples[Y + i, m]
-            steeper += drift * samples[Y + i, m]
+            gained += (c.dc_gain + (block - 1 - m) * c.dc_drift_gain) * samples[Y + i, m]
+            steeper += c.dc_drift_gain * samples[Y + i, m]
         c.dc[i] += block * c.dc_drift[i] + gained
         c.dc_drift[i] += steeper
-    correlate(controller, Y, p.coordinates)
+    correlate(c, Y, p.coordinates)
     for t in range(c.tiles):
         carrier = get(record(c.tiles_at, TILE_T, t), "carrier")
         for i in range(p.coordinates):
@@ -208,21 +194,20 @@ def innovate_block(controller):
 
 
 @kernel
-def update_envelopes(controller, integral):
+def update_envelopes(c, integral):
     """Update error envelopes, integral parts and slopes of the commands of all bands, and run the detectors.
 
     Returns whether demodulated deviations exceed the levels of the two detectors in any band.  Sample by sample the
     deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    p, samples, period, back = c.p, samples_of(controller), c.p.block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
+    p, samples, period, back = c.p, samples_of(c), c.p.block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
     over, above = zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
         carrier, feedback, reference, rise = conj(get(b, "carrier")), get(b, "feedback"), get(b, "r"), get(b, "slope")
         gain, fading = c.gain * feedback, LEAK * (get(b, "active") - feedback)
         for i in range(p.coordinates):
-            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            x = record(coordinates_of(c, t), COORDINATE_T, i)
             e, v = get(x, "e"), get(x, "v")
             if p.block > 1:
                 found = get(record(c.work_at, WORK_T, 2 * t + i), "x")
@@ -246,13 +231,12 @@ def update_envelopes(controller, integral):
 
 
 @kernel
-def synthesise_block(controller):
+def synthesise_block(c):
     """Forces of every sample into the rows Y of `samples`, linear from the last block's envelopes to these.
 
     Returns the largest drive over its limit, squared; of the samples, and of their envelope where the limit is near.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    samples = samples_of(controller)
+    samples = samples_of(c)
     peak = c.p.peak_decay * c.p.peak_decay * c.peak_squared
     for quadrature in range(2):
         if quadrature > 0 and peak <= NEAR_LIMIT:
@@ -262,28 +246,27 @@ def synthesise_block(controller):
             if quadrature > 0:
                 carrier = pair(imag(carrier), -1.0 * real(carrier))
             for i in range(c.p.coordinates):
-                x, w = record(coordinates_of(controller, t), COORDINATE_T, i), record(c.work_at, WORK_T, 2 * t + i)
+                x, w = record(coordinates_of(c, t), COORDINATE_T, i), record(c.work_at, WORK_T, 2 * t + i)
                 put(w, "x", get(x, "last_force") * carrier)
                 put(w, "rise", (get(x, "force") - get(x, "last_force")) * carrier)
-        sum_bands(controller, c.p.coordinates, True)
+        sum_bands(c, c.p.coordinates, True)
         if quadrature == 0:
             for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
-        peak = max(peak, largest_drive(controller, samples, Y, SUM, quadrature > 0))
+        peak = max(peak, largest_drive(c, samples, quadrature > 0))
     for t in range(c.tiles):
         for i in range(c.p.coordinates):
-            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            x = record(coordinates_of(c, t), COORDINATE_T, i)
             put(x, "last_force", get(x, "force"))
     return peak
 
 
 @kernel
-def reset_loop(controller):
+def reset_loop(c):
     """Reset the loop's state: no confidence in the sensors is left."""
-    c = record(controller, CONTROLLER_T, 0)
     for t in range(c.tiles):
         for i in range(c.p.coordinates):
-            x = record(coordinates_of(controller, t), COORDINATE_T, i)
+            x = record(coordinates_of(c, t), COORDINATE_T, i)
             put(x, "e", 0.0)
             put(x, "v", 0.0)
             put(x, "slope", 0.0)
@@ -296,27 +279,26 @@ def reset_loop(controller):
 
 
 @kernel
-def begin(controller, signals, first):
+def begin(c, io, first):
     """Sensors and carriers of a block, and the gains of the observer and of the DC estimate."""
-    c = record(controller, CONTROLLER_T, 0)
     p, block = c.p, c.p.block
-    c.implausible = sense_block(controller, signals, first)
+    c.implausible = sense_block(c, io, first)
     if p.lock > 0.0 and (block > 1 or c.sample % REFRESH == 0):
-        follow_resonance(controller)
-    advance_carriers(controller)
-    c.dc_fast_on = 1.0 if p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0) else 0.0
-    c.feedback_off = 1.0 if c.dc_fast_on > 0.0 or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
-    c.gain = crowding(controller) * (p.observer + c.fast_open * (p.observer_high - p.observer)) * (1.0 - c.feedback_off)
+        follow_resonance(c)
+    advance_carriers(c)
+    fast = p.needs_contact > 0.0 and (c.finger_seen <= 0.0 or c.fresh > 0.0)
+    c.dc_gain, c.dc_drift_gain = (p.dc_fast, p.dc_drift_fast) if fast else (p.dc, p.dc_drift)
+    c.feedback_off = 1.0 if fast or (p.needs_contact > 0.0 and c.speed < p.least_speed) else 0.0
+    c.gain = crowding(c) * (p.observer + c.fast_open * (p.observer_high - p.observer)) * (1.0 - c.feedback_off)
 
 
 @kernel
-def find_contact(controller, adapt_now):
+def find_contact(c, adapt_now):
     """Load, lever arm and contact of the finger by the DC estimate, and the gain of the inner damper.
 
     A contact that begins or ends raises the gains for a while.  `damper_scale` is the supervisor's: it turns a ringing
     damper down.  Returns whether the finger is to be adapted.
     """
-    c = record(controller, CONTROLLER_T, 0)
     p, k = c.p, c.p.stiffness
     load = -(k[0, 0] * c.dc[0] + k[0, 1] * c.dc[1])
     on = 1.0 if load > (p.contact_off if c.contact > 0.0 else p.contact_on) else 0.0
@@ -327,31 +309,30 @@ def find_contact(controller, adapt_now):
         c.lever = min(max(moment / max(load, LEAST_LOAD), -2.0), 2.0)
     if changed:
         c.fast_timer, c.fast_open = p.fast_time, 1.0
-        reset_finger(controller)
+        reset_finger(c)
     c.damping_gain = 0.0 if c.scale < 1.0 else c.damper_scale * (p.damper + c.fast_open * (p.damper_high - p.damper))
     return c.contact > 0.0 and p.adaptation >= 0.0
 
 
 @kernel
-def close_block(controller, touching, adapt_now):
+def close_block(c, touching, adapt_now):
     """Envelopes from the innovations, adaptation, law, and the gain schedule.
 
     A detector over its level raises the gains for a while; then they fall slowly.
     """
-    c = record(controller, CONTROLLER_T, 0)
     p, block = c.p, c.p.block
     integral = p.integral + c.slow_open * (p.integral_medium - p.integral)
     integral = (integral + c.fast_open * (p.integral_high - integral)) * (1.0 - c.feedback_off)
-    fast, slow = update_envelopes(controller, integral)
-    if update_confidence(controller, c.implausible):
-        reset_loop(controller)
+    fast, slow = update_envelopes(c, integral)
+    if update_confidence(c, c.implausible):
+        reset_loop(c)
     if touching and adapt_now:
         if block == 1:
-            note_commands(controller)
-        adapt_finger(controller, c.gain, c.damping_gain)
-    update_law(controller, touching, adapt_now)
+            note_commands(c)
+        adapt_finger(c, c.gain, c.damping_gain)
+    update_law(c, touching, adapt_now)
     if touching and block > 1:
-        note_commands(controller)
+        note_commands(c)
     if fast:
         c.fast_timer = p.fast_time
     if slow:
@@ -365,21 +346,21 @@ def close_block(controller, touching, adapt_now):
 @step
 def error_step(state, signals, start, count):
     """Advance the law by bands by `count` samples, sample by sample; see `hapticrender.jit`."""
-    c, io, samples = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), samples_of(state)
-    stop = start + count
+    c, io = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0)
+    samples, stop = samples_of(c), start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
-        begin(state, signals, n)
+        begin(c, io, n)
         if c.p.reads_waveform > 0.0:
-            analyse_sample(state)
-        update_targets(state, signals, n)
+            analyse_sample(c)
+        update_targets(c, io, n)
         adapt_now = c.sample % ADAPTATION_SAMPLES == 0
-        touching = find_contact(state, adapt_now)
-        innovate_sample(state)
-        close_block(state, touching, adapt_now)
-        apply_law(state)
-        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(state, samples, Y, SUM, True))
-        limit_drive(state, samples, Y, peak, drive, flags, n)
+        touching = find_contact(c, adapt_now)
+        innovate_sample(c)
+        close_block(c, touching, adapt_now)
+        apply_law(c)
+        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(c, samples, True))
+        limit_drive(c, samples, peak, drive, flags, n)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             flags[n] |= UNLOCKED
     return 0
@@ -388,23 +369,23 @@ def error_step(state, signals, start, count):
 @step
 def block_step(state, signals, start, count):
     """Advance the law by bands by `count` samples, in blocks of M > 1; see `hapticrender.jit`."""
-    c, io, samples = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), samples_of(state)
-    block, stop = c.p.block, start + count
+    c, io = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0)
+    samples, block, stop = samples_of(c), c.p.block, start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for first in range(start, stop, block):
-        begin(state, signals, first)
+        begin(c, io, first)
         if c.stale > 0 or c.locked > 0 or c.gain != c.response_gain:
-            turn_tables(state)
-            invert(state, c.gain)
+            turn_tables(c)
+            invert(c, c.gain)
         if c.p.reads_waveform > 0.0:
-            analyse_block(state)
-        update_targets(state, signals, first)
-        touching = find_contact(state, True)
-        innovate_block(state)
-        close_block(state, touching, True)
-        apply_law(state)
-        peak = synthesise_block(state)
-        limit_drive(state, samples, Y, peak, drive, flags, first)
+            analyse_block(c)
+        update_targets(c, io, first)
+        touching = find_contact(c, True)
+        innovate_block(c)
+        close_block(c, touching, True)
+        apply_law(c)
+        peak = synthesise_block(c)
+        limit_drive(c, samples, peak, drive, flags, first)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             for m in range(block):
                 flags[first + m] |= UNLOCKED

@@ -10,7 +10,6 @@ import math
 
 from hapticrender.control.carriers import SLOWEST
 from hapticrender.control.records import (
-    CONTROLLER_T,
     COORDINATE_T,
     LOCKED,
     STEP,
@@ -28,9 +27,8 @@ from hapticrender.vectors import get, imag, magnitude, pair, put, real, total, w
 
 
 @kernel
-def contact_damping(controller):
+def contact_damping(c):
     """Damping of a sliding contact that renews itself over a length, beyond that at the typical speed."""
-    c = record(controller, CONTROLLER_T, 0)
     p = c.p
     if p.contact_damping == 0.0:
         return 0.0
@@ -38,9 +36,8 @@ def contact_damping(controller):
 
 
 @kernel
-def turn_ahead(controller, t):
+def turn_ahead(c, t):
     """Set rho of a tile: by the delay and half the hold, and up by what the hold takes."""
-    c = record(controller, CONTROLLER_T, 0)
     b, lead = record(c.tiles_at, TILE_T, t), c.p.lead
     omega = get(b, "omega")
     x = (0.5 / c.p.rate) * omega
@@ -50,11 +47,10 @@ def turn_ahead(controller, t):
 
 
 @kernel
-def set_law(controller, t):
+def set_law(c, t):
     """Set D and D' of a tile, turned ahead by rho, with the finger as the law holds it."""
-    c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
-    p, on, g, lag = c.p, c.law_contact, c.law_lever, contact_damping(controller)
+    p, on, g, lag = c.p, c.law_contact, c.law_lever, contact_damping(c)
     omega, ahead, sweep = get(b, "omega"), get(b, "ahead"), get(b, "sweep")
     spring = on * get(b, "remainder") * ahead
     for i in range(p.coordinates):
@@ -64,19 +60,18 @@ def set_law(controller, t):
             damping = p.damping[i, j] + other * (one * (on * c.finger_damping + lag))
             stiffness = p.stiffness[i, j] + other * (one * (on * c.finger_stiffness))
             d = pair(stiffness - omega * omega * mass, omega * damping + p.dynamic * sweep * mass)
-            law = record(stiffnesses_of(controller, t), STIFFNESS_T, 2 * i + j)
+            law = record(stiffnesses_of(c, t), STIFFNESS_T, 2 * i + j)
             put(law, "d", d * ahead + other * (one * spring))
             put(law, "s", p.dynamic * pair(damping, 2.0 * mass * omega) * ahead)
 
 
 @kernel
-def follow_resonance(controller):
+def follow_resonance(c):
     """Move the shift of the carriers towards the resonance, where Re D = 0: force and motion a quarter turn apart.
 
     Near a resonance w0 of the mass m, D is 2 m w (w0 - w) + j Im D.  The lock is lost while they are more than an
     eighth of a turn from a quarter turn.
     """
-    c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, 0)
     p, w = c.p, b.omega[0]
     if w == 0.0:
@@ -90,9 +85,8 @@ def follow_resonance(controller):
 
 
 @kernel
-def update_law(controller, touching, adapt_now):
+def update_law(c, touching, adapt_now):
     """Update the law with the finger estimate: where contact changed or it is adapted, and where carriers move."""
-    c = record(controller, CONTROLLER_T, 0)
     contact = 1.0 if touching else 0.0
     due = contact != c.law_contact or (adapt_now and touching) or c.stale > 0
     if due:
@@ -105,24 +99,23 @@ def update_law(controller, touching, adapt_now):
         if locked:
             put(b, "omega", get(b, "omega") + c.p.extrapolation * get(b, "sweep"))
         if locked or c.stale > 0:
-            turn_ahead(controller, t)
+            turn_ahead(c, t)
         if locked or due:
-            set_law(controller, t)
+            set_law(c, t)
     c.stale = 0
 
 
 @kernel
-def apply_law(controller):
+def apply_law(c):
     """Force envelopes rho (D V + D' dV/dt) of all bands, and their sums in the first column of `samples`.
 
     The sums now and the inner damper's force go into the rows Y, those a quarter turn ahead into the rows SUM.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    p, ahead, samples = c.p, c.p.extrapolation, samples_of(controller)
+    p, ahead, samples = c.p, c.p.extrapolation, samples_of(c)
     for i in range(p.coordinates):
         along = pair(zeros(), zeros())
         for t in range(c.tiles):
-            b, first, laws = record(c.tiles_at, TILE_T, t), coordinates_of(controller, t), stiffnesses_of(controller, t)
+            b, first, laws = record(c.tiles_at, TILE_T, t), coordinates_of(c, t), stiffnesses_of(c, t)
             reference, force = get(b, "r") + ahead * get(b, "slope"), pair(zeros(), zeros())
             for j in range(p.coordinates):
                 x, law = record(first, COORDINATE_T, j), record(laws, STIFFNESS_T, 2 * i + j)

@@ -37,13 +37,12 @@ TABLE_POLE = TURN * 40.0  # rad/s: of the velocity by which the table is read; t
 
 
 @kernel
-def estimate(controller, t, i, y):
+def estimate(c, t, i, y):
     """Update the envelopes X of a tile in coordinate i; returns them.
 
     The low pass is a second-order section in transposed direct form II.  The mean over a window has a running sum,
     `low1`, which one from the window's first place on, `low2`, replaces once a window against rounding.
     """
-    c = record(controller, CONTROLLER_T, 0)
     x, p = record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
     found, low2 = 2.0 * y * conj(get(record(c.tiles_at, TILE_T, t), "carrier")), get(x, "low2")
     if p.window > 0:
@@ -63,9 +62,8 @@ def estimate(controller, t, i, y):
 
 
 @kernel
-def look_up(controller, t):
+def look_up(c, t):
     """Set drive per metre and lag of the free device for a tile, from the table over frequency."""
-    c = record(controller, CONTROLLER_T, 0)
     b, n = record(c.tiles_at, TILE_T, t), c.p.coordinates
     table = carray(pointer(c.gains_at, F8), (2 * n, c.p.table))
     for i in range(n):
@@ -80,9 +78,8 @@ def look_up(controller, t):
 
 
 @kernel
-def set_reference_phasor(controller, t):
+def set_reference_phasor(c, t):
     """Set amplitude and direction of the reference of a tile; in silence the last direction stays."""
-    c = record(controller, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, t)
     reference, omega = get(b, "r"), get(b, "omega")
     r_magnitude = sqrt(square(reference))
@@ -94,9 +91,9 @@ def set_reference_phasor(controller, t):
 
 
 @kernel
-def loop_controller(controller, x, error, floor):
+def loop_controller(c, x, error, floor):
     """Output of the loop controller C, a second-order section; its real part is kept above a floor."""
-    p = record(controller, CONTROLLER_T, 0).p
+    p = c.p
     out = p.loop[0] * error + get(x, "law1")
     out = pair(maximum(real(out), floor), imag(out))
     put(x, "law1", p.loop[1] * error - p.loop[3] * out + get(x, "law2"))
@@ -105,9 +102,8 @@ def loop_controller(controller, x, error, floor):
 
 
 @kernel
-def polar_loops(controller, t, i, envelope):
+def polar_loops(c, t, i, envelope):
     """Command (amplitude, phase) of a tile in coordinate i from the errors of amplitude and phase."""
-    c = record(controller, CONTROLLER_T, 0)
     b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
     r_phasor, omega_sign = get(b, "r_phasor"), get(b, "omega_sign")
     if c.p.subtracted > 0.0:  # each angle with a seam of its own
@@ -119,28 +115,27 @@ def polar_loops(controller, t, i, envelope):
         size, angle = polar(pair(real(turned), omega_sign * imag(turned)))
     # a negative amplitude would be positive feedback
     floor = 0.0 if c.p.clamped > 0.0 else -math.inf
-    out = loop_controller(controller, x, pair(get(b, "r_magnitude") - size, get(b, "r_nonzero") * angle), floor)
+    out = loop_controller(c, x, pair(get(b, "r_magnitude") - size, get(b, "r_nonzero") * angle), floor)
     return real(out), -1.0 * imag(out)
 
 
 @kernel
-def polar_law(controller):
+def polar_law(c):
     """Drive of every coordinate by the polar law, into the rows Y of `samples`.
 
     Without feedback the device's lag, delay and hold are made up for.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    samples = samples_of(controller)
+    samples = samples_of(c)
     for i in range(c.p.coordinates):
         drive = zeros()
         for t in range(c.tiles):
             b, x = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t)
             if i == 0 and (c.stale > 0 or b.mode[0] == LOCKED):
-                look_up(controller, t)
+                look_up(c, t)
             if i == 0 and (c.stale > 0 or b.mode[0] != FIXED):
-                set_reference_phasor(controller, t)
+                set_reference_phasor(c, t)
             if c.p.feedback > 0.0:
-                amplitude, angle = polar_loops(controller, t, i, estimate(controller, t, i, samples[Y + i, 0]))
+                amplitude, angle = polar_loops(c, t, i, estimate(c, t, i, samples[Y + i, 0]))
             else:
                 amplitude, angle = get(b, "r_magnitude"), c.p.lead * magnitude(get(b, "omega")) - get(x, "lag")
             turn, wave = unit((1.0 / TURN) * angle), get(b, "r_phasor") * get(b, "carrier")
@@ -151,14 +146,13 @@ def polar_law(controller):
 
 
 @kernel
-def complex_loops(controller, t, i, envelope):
+def complex_loops(c, t, i, envelope):
     """Update V and dV/dt of a tile in coordinate i; without feedback V is the reference."""
-    c = record(controller, CONTROLLER_T, 0)
     b, x, p = record(c.tiles_at, TILE_T, t), record(c.loops_at, LOW_PASS_T, i * c.tiles + t), c.p
-    own = record(coordinates_of(controller, t), COORDINATE_T, i)
+    own = record(coordinates_of(c, t), COORDINATE_T, i)
     reference, weight = p.pattern[i] * get(b, "r"), get(b, "weight")
     against = 0.0 if p.deviation > 0.0 else 1.0
-    out = loop_controller(controller, x, p.feedback * weight * (against * reference - envelope), -math.inf)
+    out = loop_controller(c, x, p.feedback * weight * (against * reference - envelope), -math.inf)
     keep = 1.0 - LEAK / p.rate * (1.0 - weight)
     put(x, "law1", keep * get(x, "law1"))
     put(x, "law2", keep * get(x, "law2"))
@@ -169,10 +163,9 @@ def complex_loops(controller, t, i, envelope):
 
 
 @kernel
-def complex_law(controller):
+def complex_law(c):
     """Force of every coordinate by the complex law and the free device's D, into the rows Y of `samples`."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, p, reference = samples_of(controller), c.p, zeros()
+    samples, p, reference = samples_of(c), c.p, zeros()
     if p.deviation > 0.0:
         for t in range(c.tiles):
             b = record(c.tiles_at, TILE_T, t)
@@ -182,16 +175,15 @@ def complex_law(controller):
         for i in range(p.coordinates):
             envelope = pair(zeros(), zeros())
             if p.feedback > 0.0:
-                envelope = estimate(controller, t, i, samples[Y + i, 0] - p.pattern[i] * expected)
-            complex_loops(controller, t, i, envelope)
-    update_law(controller, False, False)
-    apply_law(controller)
+                envelope = estimate(c, t, i, samples[Y + i, 0] - p.pattern[i] * expected)
+            complex_loops(c, t, i, envelope)
+    update_law(c, False, False)
+    apply_law(c)
 
 
 @kernel
-def reset_loops(controller):
+def reset_loops(c):
     """Reset the loops: no confidence in the sensors is left.  A window keeps its samples, which leave it in time."""
-    c = record(controller, CONTROLLER_T, 0)
     for i in range(c.p.coordinates * c.tiles):
         x = record(c.loops_at, LOW_PASS_T, i)
         if c.p.window == 0:
@@ -206,28 +198,28 @@ def reset_loops(controller):
 def low_pass_step(state, signals, start, count):
     """Advance a controller with low passes by `count` samples, every channel cut to its limit; see `jit`."""
     c, io, stop = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0), start + count
-    p, samples, limit, follow = c.p, samples_of(state), c.p.drive_limit, 1.0 - math.exp(-TABLE_POLE / c.p.rate)
+    p, samples, limit, follow = c.p, samples_of(c), c.p.drive_limit, 1.0 - math.exp(-TABLE_POLE / c.p.rate)
     drive, flags = carray(pointer(io.drive, F8), (stop, p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
         seen, held = c.finger_seen, c.held_position
-        implausible = sense_block(state, signals, n)
+        implausible = sense_block(c, io, n)
         if implausible > 0:  # these methods predict nothing
             samples[Y, 0], samples[Y + 1, 0] = 0.0, 0.0
         if c.locked > 0:
             velocity = (c.held_position - held) * p.rate if seen > 0.0 else 0.0
             c.table_velocity += follow * (velocity - c.table_velocity)
-        advance_carriers(state)
+        advance_carriers(c)
         if p.reads_waveform > 0.0:
-            analyse_sample(state)
-        update_targets(state, signals, n)
-        if update_confidence(state, implausible):
-            reset_loops(state)
+            analyse_sample(c)
+        update_targets(c, io, n)
+        if update_confidence(c, implausible):
+            reset_loops(c)
         if p.polar > 0.0:
-            polar_law(state)
+            polar_law(c)
         else:
-            complex_law(state)
+            complex_law(c)
         for i in range(p.channels):
-            exact = c.confidence * drive_of(state, samples, Y, 0, i)
+            exact = c.confidence * drive_of(c, samples, Y, 0, i)
             drive[n, i] = min(max(exact, -limit), limit)
             if abs(exact) > limit:
                 flags[n] |= SATURATED

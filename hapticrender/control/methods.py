@@ -35,7 +35,7 @@ from hapticrender.control.inverse import AdaptiveInverse
 from hapticrender.control.linear import DiscretePlant
 from hapticrender.control.loopshape import Bandwidths, envelope_loop
 from hapticrender.control.low_pass import low_pass_step
-from hapticrender.control.records import LOW_PASS, W, aligned
+from hapticrender.control.records import W
 from hapticrender.defaults import FADE_IN
 from hapticrender.errors import DesignError
 from hapticrender.protocols import Array, Method
@@ -100,13 +100,8 @@ class Polar:
             "table_step": TABLE_STEP,
             "fade_in": 1.0 / (CONTACT_FADE * model.rate),
         }
-        arrays = {"gains": table}
-        if loop["window"]:
-            arrays["window"] = aligned((loop["window"], len(sensor_map) * tiles_of(bands), 2, W))
-        controller = low_pass_controller(self.name, settings, bands, arrays)
-        fixed = np.zeros(controller.tiles["fade"].shape)
-        fixed.reshape(-1)[: len(bands)] = bands.wavenumber == 0.0
-        controller.tiles["fade"] = fixed  # a constant target is there from the start
+        controller = BankController(self.name, low_pass_step, settings, bands, arrays={"gains": table})
+        controller.tiles["fade"] = controller.setpoints[1].reshape(-1, W) == 0.0  # a constant target is there at once
         return controller
 
 
@@ -125,7 +120,7 @@ class Inverse:
         loop, width = envelope_loop(model, bands, bandwidths=self.bandwidths, feedback=feedback)
         settings = complex_settings(model, bands, width, self.feed_forward, feedback) | loop
         settings |= {"dynamic": self.dynamic, "deviation": self.feed_forward and self.filtered}
-        return low_pass_controller(self.name, settings, bands)
+        return BankController(self.name, low_pass_step, settings, bands)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +157,8 @@ class Resonant(Validated):
         settings = complex_settings(model, bands, model.lowest_frequency / 4, False, feedback)
         half = 0.5 * each * period
         settings |= {"low_pass": ALL_PASS, "loop": (half, half, 0.0, -1.0, 0.0)}
-        return low_pass_controller(self.name, settings | {"dynamic": True, "deviation": True}, bands)
+        settings |= {"dynamic": True, "deviation": True}
+        return BankController(self.name, low_pass_step, settings, bands)
 
 
 def least_decay(model: DeviceModel) -> float:
@@ -195,12 +191,11 @@ def low_pass_settings(
     """
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
     analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * width, spacing(bands))
-    ridges = ridge_spacing(bands)
     refuse_whole_waveform(bands)
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "waveform_gain": 2 * analysis / model.rate,
-        "crowd_speed": analysis / ridges if math.isfinite(ridges) else 0.0,
+        "crowd_speed": analysis / ridge_spacing(bands),
         "highest_edge": HIGHEST_EDGE,
         "feedback": feedback,
     }
@@ -219,21 +214,6 @@ def complex_settings(
         "forward": forward,
         "fade_in": 1.0 / (FADE_IN * model.rate) if forward else 1.0,
     }
-
-
-def tiles_of(bands: Bands) -> int:
-    """Number of tiles that hold the bands."""
-    return max(-(-len(bands) // W), 1)
-
-
-def low_pass_controller(
-    name: str, settings: dict[str, Any], bands: Bands, arrays: dict[str, Array] | None = None
-) -> BankController:
-    """Controller of a method with a low pass."""
-    loops = aligned(settings["coordinates"] * tiles_of(bands), LOW_PASS)
-    controller = BankController(name, low_pass_step, settings, bands, arrays={"loops": loops} | (arrays or {}))
-    controller.tiles["r_phasor_re"] = controller.tiles["omega_sign"] = 1.0
-    return controller
 
 
 _ALL: tuple[Any, ...] = (

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from numba import carray
 
-from hapticrender.jit import F8, kernel, pointer, record
+from hapticrender.jit import F8, kernel, pointer
 from hapticrender.jit import aligned as aligned
 from hapticrender.protocols import Array
 from hapticrender.vectors import W, tile_type
@@ -84,13 +84,13 @@ integral integral_medium integral_high damper damper_high
 detects fast_pole slow_pole fast_threshold slow_threshold fast_time slow_time release
 contact_on contact_off contact_damping typical_speed lock
 adaptation adaptation_high rest rest_high age least_motion typical_mass typical_stiffness
-least_mass most_mass least_damping most_damping least_stiffness most_stiffness
 polar clamped subtracted feedback forward deviation dynamic table_step
 """.split()
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
+        *((f"{name}_range", np.float64, (2,)) for name in ("mass", "damping", "stiffness")),  # of a finger
         ("pattern", np.float64, (2,)),
         ("added_damping", np.float64, (2,)),
         ("damper_noise", np.float64, (2,)),  # N rms beyond `RINGING`, of `damper_force` by sensor noise; 0: unknown
@@ -111,7 +111,7 @@ _STATE = """
 held_position held_prediction smooth_position velocity acceleration finger_seen fresh speed smooth_speed table_velocity
 load lever contact law_contact law_lever finger_mass finger_damping finger_stiffness
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
-gain damping_gain damper_scale dc_fast_on feedback_off
+gain damping_gain damper_scale dc_gain dc_drift_gain feedback_off
 """.split()
 _ARRAYS = "tiles loops commands setpoints work table phasors samples window gains"
 CONTROLLER = np.dtype(
@@ -119,13 +119,13 @@ CONTROLLER = np.dtype(
         ("p", SETTINGS),
         *((name, np.float64) for name in _STATE),
         *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation", "damper_force")),
-        ("past", np.float64, (2, MOST_TAPS)),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
+        ("past", np.float64, (2, MOST_TAPS)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "locked", "stale", "implausible")),
         *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]
 )
-"""Settings and state of a controller, and the addresses of its arrays."""
+"""Settings and state of a controller, and the addresses of its arrays; kernels take it as `c`, by reference."""
 CONTROLLER_T = numba.from_dtype(CONTROLLER)
 TILE_T, LOW_PASS_T, WORK_T, PAIR_T = map(tile_type, (TILE, LOW_PASS, WORK, PAIR))
 COORDINATE_T, STIFFNESS_T = (tile_type(_record(_complex(*names))) for names in (COORDINATE_NAMES, STIFFNESS_NAMES))
@@ -140,21 +140,20 @@ SAMPLE_ROWS = 14
 
 
 @kernel
-def coordinates_of(controller, t):
+def coordinates_of(c, t):
     """Address of the records of a tile's coordinates, of type `COORDINATE_T`."""
-    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + COORDINATES_AT
+    return c.tiles_at + t * TILE_SIZE + COORDINATES_AT
 
 
 @kernel
-def stiffnesses_of(controller, t):
+def stiffnesses_of(c, t):
     """Address of the records of the law between a tile's coordinates i and j, number 2 i + j of type `STIFFNESS_T`."""
-    return record(controller, CONTROLLER_T, 0).tiles_at + t * TILE_SIZE + STIFFNESSES_AT
+    return c.tiles_at + t * TILE_SIZE + STIFFNESSES_AT
 
 
 @kernel
-def samples_of(controller):
+def samples_of(c):
     """Work array of the samples, shape (rows, groups g); samples beyond M stay zero but for the sums."""
-    c = record(controller, CONTROLLER_T, 0)
     return carray(pointer(c.samples_at, F8), (SAMPLE_ROWS, c.p.groups * c.p.group))
 
 

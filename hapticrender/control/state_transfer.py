@@ -26,8 +26,8 @@ PARTS = 2  # of a device
 BLOCKS = (  # of a part: of its supervisor, of every controller, of the law by bands, of the waveform law
     *("tests", "heat", "sensors", "forces", "gains"),
     "tracker",
-    *("finger", "rounding"),
-    *("contact", "shaping", "learned", "window", "ring", "reference"),
+    "finger",
+    *("contact", "learned", "window", "ring", "reference"),
 )
 ROWS = PARTS * len(BLOCKS)
 
@@ -106,11 +106,11 @@ def _blocks(part: Any) -> dict[str, Block]:
         return found
     at = state.ctypes.data
     found["tracker"] = _fields(at, CONTROLLER, "held_position", "fresh")
-    finger, rounding = _fields(at, CONTROLLER, "fresh", "past"), _fields(at, CONTROLLER, "shaper", "sample")
+    finger = _fields(at, CONTROLLER, "fresh", "past")  # and the rounding
     if not isinstance(part, WaveformController):
-        return found | {"finger": finger, "rounding": rounding}
+        return found | {"finger": finger}
     law, at, delay = part.law, int(state["loops_at"][0]), int(part.law["delay"])
-    found |= {"contact": finger, "shaping": rounding}  # the same fields, which mean other things there
+    found |= {"contact": finger}  # the same fields, which mean other things there
     found |= {"learned": _fields(at, INVERSE, "fade", "ring_at"), "window": _fields(at, INVERSE, "window")}
     return found | {"ring": (int(law["ring_at"]), RING * (delay + 1)), "reference": (int(law["reference_at"]), delay)}
 

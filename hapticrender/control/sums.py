@@ -13,7 +13,6 @@ z_d, filled anew for each group, its mean velocity.
 from hapticrender.control.carriers import FASTEST
 from hapticrender.control.records import (
     ANALYSIS,
-    CONTROLLER_T,
     FOLDED,
     INVERSE,
     LOCKED,
@@ -32,10 +31,9 @@ from hapticrender.vectors import conj, fused, get, imag, pair, put, real, total,
 
 
 @kernel
-def turn_pairs(controller, t, q):
+def turn_pairs(c, t, q):
     """Fill table and phasor of a tile for a group, relative to the block's start, by the finger's mean motion."""
-    c = record(controller, CONTROLLER_T, 0)
-    b, samples, group = record(c.tiles_at, TILE_T, t), samples_of(controller), c.p.group
+    b, samples, group = record(c.tiles_at, TILE_T, t), samples_of(c), c.p.group
     middle, pairs, first = 0.5 * (group - 1), (group + 1) // 2, q * group
     last = min(first + group, c.p.block) - 1
     speed = (samples[POSITION, last] - samples[POSITION, first]) / max(last - first, 1)
@@ -52,19 +50,17 @@ def turn_pairs(controller, t, q):
 
 
 @kernel
-def turn_tables(controller):
+def turn_tables(c):
     """Fill the tables where carriers follow the finger or are other ones, the first group last."""
-    c = record(controller, CONTROLLER_T, 0)
     for t in range(c.tiles):
         if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED or c.stale > 0:
             for q in range(c.p.groups - 1, -1, -1):
-                turn_pairs(controller, t, q)
+                turn_pairs(c, t, q)
 
 
 @kernel
-def sum_pairs(controller, k, other, i, rising):
+def sum_pairs(c, k, other, i, rising):
     """Sums over the bands for pairs k and `other` of a group in coordinate i: Re y cos and Im y sin of either."""
-    c = record(controller, CONTROLLER_T, 0)
     even0, odd0, slope_even0, slope_odd0 = zeros(), zeros(), zeros(), zeros()
     even1, odd1, slope_even1, slope_odd1 = zeros(), zeros(), zeros(), zeros()
     for t in range(c.tiles):
@@ -82,16 +78,15 @@ def sum_pairs(controller, k, other, i, rising):
 
 
 @kernel
-def sum_bands(controller, count, rising):
+def sum_bands(c, count, rising):
     """Sum Re(x z[m]) over the bands for `count` envelopes x, which may rise linearly over the block; rows SUM."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, group, block, tiles = samples_of(controller), c.p.group, c.p.block, c.tiles
+    samples, group, block, tiles = samples_of(c), c.p.group, c.p.block, c.tiles
     middle, pairs = 0.5 * (group - 1), (group + 1) // 2
     for q in range(c.p.groups):
         share = (q * group + middle + 1.0) / block
         for t in range(tiles):
             if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
-                turn_pairs(controller, t, q)
+                turn_pairs(c, t, q)
             z = get(record(c.phasors_at, PAIR_T, q * tiles + t), "z")
             for i in range(count):
                 w = record(c.work_at, WORK_T, 2 * t + i)
@@ -103,7 +98,7 @@ def sum_bands(controller, count, rising):
         for k in range(0, pairs, 2):  # two pairs at a time: a sum waits for the one before it
             other = min(k + 1, pairs - 1)
             for i in range(count):
-                even0, odd0, even1, odd1 = sum_pairs(controller, k, other, i, rising)
+                even0, odd0, even1, odd1 = sum_pairs(c, k, other, i, rising)
                 early, late = q * group + pairs - 1, q * group + group - pairs
                 samples[SUM + i, early - k] = total(even0 + odd0)
                 samples[SUM + i, late + k] = total(even0 - odd0)
@@ -112,10 +107,9 @@ def sum_bands(controller, count, rising):
 
 
 @kernel
-def correlate(controller, row, count):
+def correlate(c, row, count):
     """Sums over the block of `count` rows of `samples` times z[m] of every band, into the envelopes x."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, group, tiles = samples_of(controller), c.p.group, c.tiles
+    samples, group, tiles = samples_of(c), c.p.group, c.tiles
     pairs = (group + 1) // 2
     for i in range(count):
         for start in range(0, c.p.groups * group, group):
@@ -131,7 +125,7 @@ def correlate(controller, row, count):
             x = pair(zeros(), zeros())
             for q in range(c.p.groups):
                 if record(c.tiles_at, TILE_T, t).mode[0] == LOCKED:
-                    turn_pairs(controller, t, q)
+                    turn_pairs(c, t, q)
                 even, odd = zeros(), zeros()
                 for k in range(pairs):
                     z, m = get(record(c.table_at, PAIR_T, k * tiles + t), "z"), q * group + k
@@ -141,13 +135,12 @@ def correlate(controller, row, count):
 
 
 @kernel
-def invert(controller, g):
+def invert(c, g):
     """Set the response r of the observer, and the first columns of (1 + L)^-1 for innovation and waveform.
 
     L[m, j] = g_dc + (m - j - 1) g_drift + g r[m - j] for m > j.
     """
-    c = record(controller, CONTROLLER_T, 0)
-    samples, block, p = samples_of(controller), c.p.block, c.p
+    samples, block, p = samples_of(c), c.p.block, c.p
     last = (p.group + 1) // 2 - 1
     for t in range(c.tiles):
         w, b = record(c.work_at, WORK_T, 2 * t), record(c.tiles_at, TILE_T, t)
@@ -155,7 +148,7 @@ def invert(controller, g):
             get(record(c.table_at, PAIR_T, last * c.tiles + t), "z")
         )
         put(w, "x", get(b, "feedback") * conj(first))  # relative to the block's first sample
-    sum_bands(controller, 1, False)
+    sum_bands(c, 1, False)
     for m in range(block):
         samples[RESPONSE, m] = samples[SUM, m]
     for row in range(INVERSE, ANALYSIS + 1):
@@ -170,10 +163,9 @@ def invert(controller, g):
 
 
 @kernel
-def solve(controller, row, inverse):
+def solve(c, row, inverse):
     """Replace a row of residuals by Q times it: from what held envelopes leave to the sample-by-sample observer's."""
-    c = record(controller, CONTROLLER_T, 0)
-    samples, block = samples_of(controller), c.p.block
+    samples, block = samples_of(c), c.p.block
     x, q, found = samples[row], samples[inverse], samples[SOLVED]
     for m in range(block):
         found[m] = 0.0

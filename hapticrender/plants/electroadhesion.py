@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -21,10 +21,7 @@ from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
 from hapticrender.plants.gap_estimator import VACUUM, gap_record
 from hapticrender.plants.sliding_contact import SlidingParameters, sliding_record
-from hapticrender.protocols import Array
-
-if TYPE_CHECKING:
-    from hapticrender.touch.finger import Finger
+from hapticrender.touch.finger import Finger
 
 DRY, NORMAL, MOIST = 100.0, 4.0, 0.5  # ohm m2: leakage of the gap (engineering defaults: L = 1.0, 0.90, 0.12)
 BLOCKING = 1e6  # s: time constant of a capacitor that does not leak
@@ -196,7 +193,26 @@ class ElectroadhesionScreen(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters = parameters
         self.noise_channels = 1 + 2 * parameters.oversampling if parameters.sensor == "impedance" else 1
-        self.state = screen_record(parameters, compensation)
+        p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
+        turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
+        elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
+        self.state = record_of(
+            SCREEN,
+            p,
+            compensation,
+            carrier=p.level == "carrier",
+            voltage=p.drive_kind == "voltage",
+            sensing=p.sensor == "impedance",
+            compensated=compensation is not None,
+            substep=substep,
+            turn=turn,
+            area=p.area(1.0),
+            capacitance=(p.insulator_capacitance, p.corneum_capacitance, VACUUM / p.gap_thickness),
+            retention=[each[0] for each in elements],
+            alternating=[each[1] for each in elements],
+            gap=gap_record(p)[0],
+            sliding=sliding_record(p)[0],
+        )
         self._shape = compensation
 
     @property
@@ -209,27 +225,3 @@ class ElectroadhesionScreen(CompiledPlant):
         self._shape, self.state["compensated"] = shape, True
         for name in ("bias", "floor", "gain", "straight"):
             self.state[name] = getattr(shape, name)
-
-
-def screen_record(parameters: ElectroadhesionParameters, compensation: SquareRoot | None) -> Array:
-    """Return the record (`SCREEN`, shape (1,)) of a screen at rest."""
-    p, substep = parameters, 1.0 / (parameters.rate * parameters.oversampling)
-    turn, corneum = np.exp(1j * p.omega * substep), p.corneum_resistance * p.corneum_capacitance
-    elements = [element.py_func(tau, substep, p.omega, turn) for tau in (BLOCKING, corneum, corneum)]
-    return record_of(
-        SCREEN,
-        p,
-        compensation,
-        carrier=p.level == "carrier",
-        voltage=p.drive_kind == "voltage",
-        sensing=p.sensor == "impedance",
-        compensated=compensation is not None,
-        substep=substep,
-        turn=turn,
-        area=p.area(1.0),
-        capacitance=(p.insulator_capacitance, p.corneum_capacitance, VACUUM / p.gap_thickness),
-        retention=[each[0] for each in elements],
-        alternating=[each[1] for each in elements],
-        gap=gap_record(p)[0],
-        sliding=sliding_record(p)[0],
-    )

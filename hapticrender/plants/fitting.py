@@ -147,20 +147,21 @@ def starting_plate(expected: PlateParameters, solved: Array) -> PlateParameters:
     return replace(expected, **changes)
 
 
-def check_wiring(expected: PlateParameters, record: Record, latest: int) -> None:
-    """Refuse a record that needs a negative mass or stiffness, or leaves the drive force unexplained.
+def solve_checked(expected: PlateParameters, record: Record, latest: int) -> tuple[Array, int]:
+    """Return the parameters and the delay of `equation_error`; refuse a record that does not fit the wiring.
 
-    The `DesignError` names the cause: sensors or coils that are swapped, inverted or without effect, or another device.
+    That is one that needs a negative mass or stiffness, or leaves the drive force unexplained.  The `DesignError` names
+    the cause: sensors or coils that are swapped, inverted or without effect, or another device.
     """
     shares = {}
     for name, (sensors, coils) in WIRINGS.items():
         if np.linalg.det(sensors) == 0.0:  # what a dead sensor does not show is not found here
             continue
         trial = replace(record, sensed=record.sensed @ sensors, drive=record.drive @ coils)
-        solved, _, explained = equation_error(expected, trial, latest)
+        solved, late, explained = equation_error(expected, trial, latest)
         shares[name] = explained if (solved[:4] > 0).all() else 0.0
         if shares["nothing"] >= EXPLAINED:
-            return
+            return solved, late
     fault = max(shares, key=lambda name: shares[name])
     cause = f"{fault}: rewire" if shares[fault] >= EXPLAINED else "check device and [device]"
     share, bound = 100 * shares["nothing"], 100 * EXPLAINED
@@ -191,6 +192,24 @@ def starting_bending(fit: Fit, record: Record, variance: float) -> tuple[float, 
         if best is None or clear[at] > best[0]:
             best = float(clear[at]), (float(modes[at, 0]), damping, float(coil[at]))
     return best[1] if best is not None and best[0] > CLEAREST else None
+
+
+def fit_plate(expected: PlateParameters, record: Record, latest: int) -> Fit:
+    """Fit the plate to a record, as rigid, then once more with a bending mode where one is clear.
+
+    Its delay is at most `latest` samples.  A `DesignError` where wiring or device are not as expected, a
+    `numpy.linalg.LinAlgError` where the record does not determine all unknowns.
+    """
+    solved, late = solve_checked(expected, record, latest)
+    rigid = output_error(starting_plate(replace(expected, bending_frequency=0.0), solved), late, record)
+    start = starting_bending(rigid, record, variances(rigid, record)[1])
+    if start is None:
+        return rigid
+    frequency, damping, coil = start
+    plate = replace(rigid.plate, bending_frequency=frequency, bending_damping=damping, bending_coil=coil)
+    fit = output_error(plate, float(rigid.unknown[DELAY]), record)
+    clear = 1 / math.sqrt(fit.covariance[-1, -1] * max(variances(fit, record)[:2]))
+    return fit if clear > CLEAREST else rigid
 
 
 def output_error(start: PlateParameters, late: float, record: Record) -> Fit:

@@ -22,19 +22,14 @@ from hapticrender.driver_checks import check_channels, check_driver, check_sense
 from hapticrender.errors import DesignError, noted_on
 from hapticrender.plants.fitting import (
     BENDING,
-    CLEAREST,
     DELAY,
     GAIN,
     MECHANICAL,
     Fit,
     Record,
-    check_wiring,
-    equation_error,
-    output_error,
+    fit_plate,
     sensor_gains,
     spectra,
-    starting_bending,
-    starting_plate,
     static_load,
     variances,
 )
@@ -221,28 +216,13 @@ def _fitted(driver: Driver, parameters: PlateParameters, seconds: float, amplitu
     record = spectra(rate, sine, sensed)
     _check_response(record, amplitude)
     latest = round((wait - RAMP) * rate)
-    check_wiring(parameters, record, latest)
-    solved, late, _ = equation_error(parameters, record, latest)
     try:
-        fit = output_error(starting_plate(replace(parameters, bending_frequency=0.0), solved), late, record)
-        fit = _with_bending(fit, record) or fit
+        fit = fit_plate(parameters, record, latest)
     except np.linalg.LinAlgError as error:
         raise DesignError(f"{seconds=:g} s: does not determine all parameters; lengthen the record") from error
     found = _identified(fit, record, driver)
     _check_free(found, record)
     return found
-
-
-def _with_bending(rigid: Fit, record: Record) -> Fit | None:
-    """Fit all once more with a bending mode; None where there is none that is clear."""
-    start = starting_bending(rigid, record, variances(rigid, record)[1])
-    if start is None:
-        return None
-    frequency, damping, coil = start
-    plate = replace(rigid.plate, bending_frequency=frequency, bending_damping=damping, bending_coil=coil)
-    fit = output_error(plate, float(rigid.unknown[DELAY]), record)
-    clear = 1 / math.sqrt(fit.covariance[-1, -1] * max(variances(fit, record)[:2]))
-    return fit if clear > CLEAREST else None
 
 
 def _samples(driver: Driver, parameters: PlateParameters, seconds: float) -> int:

@@ -240,7 +240,7 @@ class Plate(CompiledPlant):
     def __init__(self, parameters: PlateParameters, finger: Finger, seed: int = 0, block: int = 1) -> None:
         self.drive_channels = parameters.coils
         super().__init__(finger, parameters.rate, delay=parameters.delay, block=block, seed=seed)
-        self.parameters, self._mechanics = parameters, finger.mechanics
+        self.parameters = parameters
         self.buffers = (np.zeros((self.delay - block, parameters.coils)),)
         structure(parameters, finger.mechanics)  # refuses what cannot be
         for function in FUNCTIONS.values():
@@ -249,7 +249,43 @@ class Plate(CompiledPlant):
     @cached_property
     def state(self) -> Array:  # type: ignore[override]
         """Record of the step, made with the first sample: its compiled functions are expected until then."""
-        return _record(self.parameters, self._mechanics, *self.buffers)
+        p, mechanics, (queue,), period = self.parameters, self.finger.mechanics, self.buffers, 1.0 / self.rate
+        free = structure(p)
+        kept = np.flatnonzero([True, p.degrees_of_freedom == 2, p.bending_frequency > 0.0])
+        s = record_of(
+            PLATE,
+            p,
+            columns=COLUMNS,
+            channels=p.coils,
+            queue=queue,
+            latency=len(queue),
+            held=np.nan,
+            bent_at=np.nan,
+            lever=np.nan,
+            strength=np.nan,
+            period=period,
+            lever_per_metre=1.0 / p.half_spacing,
+            reach=p.glass_length / p.coil_spacing,
+            nodes_per_lever=(NODES - 1) / (2.0 * (p.glass_length / p.coil_spacing)),
+            sensor_limit=p.sensor_range / 2,
+            sensor_gain=(p.sensor_gain_1, p.sensor_gain_2),
+            **{name: function.address for name, function in FUNCTIONS.items()},
+        )
+        for first, matrix, scale in (0, free.stiffness, -(period**2)), (4, free.damping, -period):
+            s["free"][0, first + kept[:, None], kept] = scale * matrix
+        s["free"][0, 8 : 8 + p.coils][:, kept] = period**2 * free.inputs[:, :-1].T
+        s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
+        if p.finger_dynamics and mechanics.order:
+            s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
+        if p.finger_dynamics and mechanics.order == 4:
+            s["inverse_mass"][0, 3] = 1.0 / mechanics.phalanx_mass
+            s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
+        s["outputs"][0][:, kept] = free.outputs[:3]
+        s["system"][0, 4:8, :4] = np.eye(4)
+        if p.bending_frequency > 0.0:
+            wavenumber, *weights = p.bending_bar
+            s["shape"] = wavenumber * p.half_spacing, *weights
+        return s
 
     def inputs(self, first: int, n: int) -> Array:
         """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""
@@ -260,45 +296,3 @@ class Plate(CompiledPlant):
     def noise(self, n: int) -> Array:
         """Draw the noise of both sensors; nothing is drawn where they have none."""
         return super().noise(n) if self.parameters.sensor_noise > 0.0 else np.zeros((n, 2))
-
-
-def _record(parameters: PlateParameters, mechanics: FingerMechanics, queue: Array) -> Array:
-    """State of the compiled plate at rest, with the `queue` of its drive."""
-    p, period = parameters, 1.0 / parameters.rate
-    free, loaded = structure(p), structure(p, mechanics)
-    many, scales = len(free.mass), (-(period**2), -period, period**2)
-    kept = np.flatnonzero([True, p.degrees_of_freedom == 2, p.bending_frequency > 0.0])
-    s = record_of(
-        PLATE,
-        p,
-        columns=COLUMNS,
-        channels=p.coils,
-        queue=queue,
-        latency=len(queue),
-        held=np.nan,
-        bent_at=np.nan,
-        lever=np.nan,
-        strength=np.nan,
-        period=period,
-        lever_per_metre=1.0 / p.half_spacing,
-        reach=p.glass_length / p.coil_spacing,
-        nodes_per_lever=(NODES - 1) / (2.0 * (p.glass_length / p.coil_spacing)),
-        sensor_limit=p.sensor_range / 2,
-        sensor_gain=(p.sensor_gain_1, p.sensor_gain_2),
-        **{name: function.address for name, function in FUNCTIONS.items()},
-    )
-    for first, matrix, scale in zip((0, 4), (free.stiffness, free.damping), scales, strict=False):
-        s["free"][0, first + kept[:, None], kept] = scale * matrix
-    s["free"][0, 8 : 8 + p.coils][:, kept] = scales[2] * free.inputs[:, :-1].T
-    s["inverse_mass"][0, kept] = 1.0 / free.mass.diagonal()
-    if p.finger_dynamics and mechanics.order:
-        s["skin"] = period**2 * mechanics.stiffness, period * mechanics.damping, mechanics.mass
-    if len(loaded.mass) > many:
-        s["inverse_mass"][0, 3] = 1.0 / loaded.mass[-1, -1]
-        s["phalanx"] = period**2 * mechanics.phalanx_stiffness, period * mechanics.phalanx_damping
-    s["outputs"][0][:, kept] = free.outputs[:3]
-    s["system"][0, 4:8, :4] = np.eye(4)
-    if p.bending_frequency > 0.0:
-        wavenumber, *weights = p.bending_bar
-        s["shape"] = wavenumber * p.half_spacing, *weights
-    return s

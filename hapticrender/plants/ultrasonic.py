@@ -12,7 +12,6 @@ import numpy as np
 
 from hapticrender.bands import NYQUIST_MARGIN
 from hapticrender.checks import Validated, option, parameter, require
-from hapticrender.control.device_model import DeviceModel
 from hapticrender.jit import record_of
 from hapticrender.plants.compiled import LOAD, STRENGTH, CompiledPlant, resolution
 from hapticrender.plants.ultrasonic_kernels import MODE, ultrasonic_step
@@ -147,27 +146,6 @@ class UltrasonicParameters(Validated):
 
     drive_step = resolution("drive_bits", "drive_limit", 2.0, "the drive (V)")
     sensor_step = resolution("sensor_bits", "sensor_range", 1.0, "the sensor (m)")
-
-    def device_model(self, rate: float, delay: int) -> DeviceModel:
-        """Device model of the free, cold plate in a loop of `rate` (Hz) and `delay` (samples)."""
-        omega = 2 * math.pi * self.carrier
-        return DeviceModel(
-            rate=rate,
-            delay=delay,
-            mass=np.array([[self.mass]]),
-            damping=np.array([[float(self.damping())]]),
-            stiffness=np.array([[self.mass * omega**2]]),
-            force_from_drive=np.array([[self.force_constant]]),
-            coordinate_from_sensed=np.eye(1),
-            side_from_coordinate=np.eye(1),
-            place_from_coordinate=np.eye(1),
-            places=("amplitude",),
-            drive_limit=self.drive_limit,
-            sensed_limit=self.sensor_range / 2,
-            drive_step=self.drive_step,
-            sensed_noise=self.sensor_noise,
-            rigid=True,
-        )
 
 
 def _finger_scale(normal_load: Array | float) -> Array:

@@ -27,7 +27,7 @@ from hapticrender.touch.finger import Finger
 
 MOST_INNER_DELAY = 8  # samples: with a longer delay there is no inner loop
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
-PACED_DELAY_ALONE = 1 / 40  # s, of pace times the delay, where there is none: see `resonant` for both
+PACED_DELAY_ALONE = 1 / 40  # s, of pace times the delay, where there is none: see `amplitude_model`
 TAPS = 6  # of the inner loop: at 384 kHz three need a drive eight times as noisy for a sixth more of damping
 DRIVEN = 0.9  # of the drive's limit: what an amplitude may need, as feedback adds to it
 MOST_DETUNING = 0.015  # of the resonance: range of the amplitude loop
@@ -110,47 +110,55 @@ class SurfaceParameters(SlidingParameters):
         return 1.0 / (self.lag_response(frequency, speed) * self._shift(np.asarray(frequency, float) / 2))
 
     def amplitude_model(self) -> DeviceModel:
-        """Device model of the mode for its amplitude loop, with the range of fingers and temperatures."""
+        """Device model of the mode for its amplitude loop, with the range of fingers and temperatures.
+
+        Observer and integral grow with the pace, what they lose by delay with the delay.  With an inner loop the pace
+        leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz.  Without one (a block
+        device) it leaves a modulus margin of 0.35 (Ms 2.9), the finger estimate being part of the loop: thin, but at
+        two thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of 3 %.
+        """
         mode = self.carrier_mode
-        return resonant(mode.device_model(mode.rate, mode.delay), mode, self.lock)
-
-    def amplitude_bands(self) -> Bands:
-        """Return the band of the carrier, whose amplitude (m) is the waveform of the reference."""
-        carrier = np.array([self.carrier_mode.carrier])
-        none = np.zeros(1)
-        return Bands(frequency=carrier, wavenumber=none, phase=none, envelope=none + 1.0, modulated=True)
-
-
-def resonant(model: DeviceModel, mode: UltrasonicParameters, lock: float) -> DeviceModel:
-    """Device model of a mode whose carrier is locked to its resonance with a bandwidth of `lock` (Hz).
-
-    Observer and integral grow with the pace, what they lose by delay with the delay.  With an inner loop the pace
-    leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz.  Without one (a block
-    device) it leaves a modulus margin of 0.35 (Ms 2.9), the finger estimate being part of the loop: thin, but at two
-    thirds of it a texture of 400 Hz behind the longest delay is 12 % off in place of 3 %.
-    """
-    stiffness, damping = float(model.stiffness[0, 0]), float(model.damping[0, 0])
-    detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are kept in Hz at either level
-    finger = MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier
-    inner = model.delay <= MOST_INNER_DELAY and turns(oscillators(model)) <= 1.0
-    paced, delay = (PACED_DELAY, model.delay + 1) if inner else (PACED_DELAY_ALONE, model.delay)
-    return replace(
-        model,
-        pace=paced * model.rate / delay,
-        lock=lock,
-        taps=TAPS,
-        always_damped=True,
-        finger=FingerRange(
+        stiffness, damping = mode.mass * (2 * np.pi * mode.carrier) ** 2, float(mode.damping())
+        free = DeviceModel(
+            rate=mode.rate,
+            delay=mode.delay,
+            mass=np.array([[mode.mass]]),
+            damping=np.array([[damping]]),
+            stiffness=np.array([[stiffness]]),
+            force_from_drive=np.array([[mode.force_constant]]),
+            coordinate_from_sensed=np.eye(1),
+            side_from_coordinate=np.eye(1),
+            place_from_coordinate=np.eye(1),
+            places=("amplitude",),
+            drive_limit=mode.drive_limit,
+            sensed_limit=mode.sensor_range / 2,
+            drive_step=mode.drive_step,
+            sensed_noise=mode.sensor_noise,
+            rigid=True,
+            lock=self.lock,
+            taps=TAPS,
+            always_damped=True,
+        )
+        detuned = 2 * MOST_DETUNING * stiffness * mode.frequency / mode.carrier  # shifts are in Hz at either level
+        finger = FingerRange(
             mass=(0.0, 0.0),
-            damping=(-0.9 * damping, finger),
+            damping=(-0.9 * damping, MOST_DAMPING * mode.finger_damping * mode.frequency / mode.carrier),
             stiffness=(-detuned, detuned),
             typical_mass=1e-12,
             typical_stiffness=detuned * TYPICAL_DETUNING / MOST_DETUNING,
             least_motion=LEAST_AMPLITUDE,
             fastest=LEARNING,
             contact=None,
-        ),
-    )
+        )
+        inner = free.delay <= MOST_INNER_DELAY and turns(oscillators(free)) <= 1.0
+        paced, delay = (PACED_DELAY, free.delay + 1) if inner else (PACED_DELAY_ALONE, free.delay)
+        return replace(free, pace=paced * free.rate / delay, finger=finger)
+
+    def amplitude_bands(self) -> Bands:
+        """Return the band of the carrier, whose amplitude (m) is the waveform of the reference."""
+        carrier = np.array([self.carrier_mode.carrier])
+        none = np.zeros(1)
+        return Bands(frequency=carrier, wavenumber=none, phase=none, envelope=none + 1.0, modulated=True)
 
 
 def full_slew(mode: UltrasonicParameters) -> float:
@@ -185,8 +193,33 @@ class UltrasonicSurface(CompiledPlant):
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.loop = parameters, amplitude
         self.noise_channels = 1 + parameters.substeps
-        self.state, queue = surface_record(parameters, amplitude, nominal)
+        p, mode, ours = parameters, parameters.carrier_mode, isinstance(amplitude, BankController)
+        inner, queue = mode_record(mode, mode.delay - 1)
+        if p.sensor == "amplitude" and not ours:
+            raise TypeError(
+                f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
+            )
         self.buffers = (queue,)
+        self.state = record_of(
+            SURFACE,
+            p,
+            load=nominal[0],
+            speed=nominal[1],
+            slew=full_slew(mode),
+            free_damping=float(mode.damping()),
+            estimating=p.sensor == "amplitude",
+            controller=amplitude.step.address,
+            controller_state=amplitude.state,
+            finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
+            position=np.nan,
+            reached=-1.0,
+            law=p.friction_law.numbers,
+            mode=inner[0],
+            sliding=sliding_record(p)[0],
+        )
+        for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
+            self.state["signals"][name] = self.state[name].ctypes.data
+        self.state["signals_at"] = self.state["signals"].ctypes.data
 
     def inputs(self, first: int, n: int) -> Array:
         """Inputs of the finger, then damping (N s/m) and resonance (rad/s) of the mode, shape (n, 6)."""
@@ -196,35 +229,3 @@ class UltrasonicSurface(CompiledPlant):
     def amplitude(self) -> Array:
         """True amplitude of the mode (m, shape (n,)) in each sample of the last run."""
         return self.motion[:, AMPLITUDE]
-
-
-def surface_record(parameters: SurfaceParameters, amplitude: Any, nominal: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the record (`SURFACE`, shape (1,)) of a surface at rest, and its drive's queue."""
-    p, mode = parameters, parameters.carrier_mode
-    inner, queue = mode_record(mode, mode.delay - 1)
-    ours = isinstance(amplitude, BankController)
-    if p.sensor == "amplitude" and not ours:
-        raise TypeError(
-            f"amplitude is a {type(amplitude).__name__}: must be a BankController, which observes the amplitude"
-        )
-    record = record_of(
-        SURFACE,
-        p,
-        load=nominal[0],
-        speed=nominal[1],
-        slew=full_slew(mode),
-        free_damping=float(mode.damping()),
-        estimating=p.sensor == "amplitude",
-        controller=amplitude.step.address,
-        controller_state=amplitude.state,
-        finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
-        position=np.nan,
-        reached=-1.0,
-        law=p.friction_law.numbers,
-        mode=inner[0],
-        sliding=sliding_record(p)[0],
-    )
-    for name in ("drive", "sensed", "position", "waveform", "target", "flags"):
-        record["signals"][name] = record[name].ctypes.data
-    record["signals_at"] = record["signals"].ctypes.data
-    return record, queue
