@@ -87,7 +87,7 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
             known = {name: value for name, value in offered.items() if name in taken and value is not None}
             made = factory(*[argument] * bool(colon), **known | options)
     except TypeError as error:
-        raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT") from error
+        raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT?OPTION=VALUE") from error
     warn_of_calibration(text, profile, lambda name, _: name in taken or "profile" in taken)
     with suppress(TypeError):  # of what cannot be referred to weakly
         _MADE[id(made)] = made

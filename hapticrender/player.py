@@ -29,7 +29,7 @@ import numpy as np
 
 from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
-from hapticrender.devices import open_driver
+from hapticrender.devices import open_driver, registered
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion, is_called_back
@@ -42,10 +42,12 @@ from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
 from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import MOST_LOAD, Finger
+from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 
 MOST_GAIN = 10.0
 LONGEST_WATCHDOG = 60.0  # s
+ANY = Grating(frequency=100.0, amplitude=1e-6)
 NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
 LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end, as it is designed, as a recording says
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
@@ -114,6 +116,7 @@ class Player(Addressed):
         else:
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
+        registered("renderers", self._scene(texture=ANY).device)  # all but the texture is refused at once
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)

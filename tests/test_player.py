@@ -304,3 +304,17 @@ def test_a_driver_that_another_player_has_open_is_refused():
         first.sleep(0.5)
         assert first.state().bands[0].error < 0.02
     assert id(driver) not in OPEN
+
+
+@pytest.mark.parametrize(
+    ("device", "error", "message"),
+    [
+        ("vt_plate", ValueError, "device 'vt_plate' is not installed: must be one of .*vt-plate"),
+        (replace(hr.Scene(texture=TONE, duration=1.0), device="tea"), ValueError, "device 'tea' is not installed"),
+        (None, TypeError, "device is missing: must be"),
+        ("none.toml", hr.SceneError, "none.toml: must be a readable file"),
+    ],
+)
+def test_a_device_that_cannot_be_is_refused_at_once(device, error, message):
+    with pytest.raises(error, match=message):
+        hr.Player(device)
