@@ -5,6 +5,7 @@ import pytest
 from electroadhesive import Screen
 from live_devices import Told
 from scipy.signal import step
+from strangers_resonator import Resonator
 from test_ultrasonic_rendering import watched
 
 import hapticrender as hr
@@ -15,7 +16,11 @@ from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 START = 0.3  # s: when the sensor fails
 ZERO = 2e-3  # s from the stop to zero drive
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
-DEVICES = {"ultrasonic": watched, "electroadhesion": lambda finger, tell: Screen(blind=False, finger=finger, tell=tell)}
+DEVICES = {
+    "ultrasonic": watched,
+    "resonator": lambda finger, tell: Resonator(load=lambda time: 0.4, tell=tell, block=16),  # shares no code
+    "electroadhesion": lambda finger, tell: Screen(blind=False, finger=finger, tell=tell),
+}
 FAULTS = {  # what is sensed instead of `sensed`, of which `last` was the last sample
     "healthy": lambda sensed, last, rng: sensed,
     "frozen": lambda sensed, last, rng: np.broadcast_to(last, sensed.shape),
@@ -45,7 +50,9 @@ def spoiled(kind, fault):
 def run(kind, fault):
     """Run 0.6 s: the device, the scene, its recording, and what stopped it, or None."""
     device = spoiled(kind, fault)
-    scene = hr.Scene(texture=hr.Grating(frequency=100.0, velocity=10e-3), finger=FINGER, device=kind, duration=0.6)
+    texture = hr.Grating(frequency=100.0, velocity=10e-3)
+    device_kind = "ultrasonic" if kind == "resonator" else kind
+    scene = hr.Scene(texture=texture, finger=FINGER, device=device_kind, duration=0.6)
     try:
         return device, scene, hr.render(scene, driver=device), None
     except hr.DeviceFault as found:
@@ -66,6 +73,7 @@ STOPPED = [  # and within which time (s)
     ("ultrasonic", "gain of 3", 0.1e-3, "jumped from one sample to the next"),
     ("ultrasonic", "gain of 1/3", 0.1e-3, "jumped from one sample to the next"),
     ("ultrasonic", "noise", 0.1e-3, "jumped from one sample to the next"),
+    *(("resonator", fault, 0.1e-3, "jumped") for fault in ("dead", "inverted", "gain of 3", "gain of 1/3", "noise")),
     ("electroadhesion", "frozen", 8e-3, "one value repeats"),
     ("electroadhesion", "dead", 0.3e-3, "jumped from one sample to the next"),
     ("electroadhesion", "noise", 0.3e-3, "jumped from one sample to the next"),
@@ -208,8 +216,9 @@ def play_steps(tell):
     hr.render(hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=0.4), driver=device)
 
 
-def test_a_healthy_ultrasonic_surface_is_not_stopped():
-    device, _, recording, found = run("ultrasonic", "healthy")
+@pytest.mark.parametrize("kind", ["ultrasonic", "resonator"])
+def test_a_healthy_ultrasonic_surface_is_not_stopped(kind):
+    device, _, recording, found = run(kind, "healthy")
     assert found is None
     assert not (recording.flags & hr.Flag.STOPPED).any()
     for blocks in (device.played, device.moved):

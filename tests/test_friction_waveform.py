@@ -7,13 +7,14 @@ import pytest
 import waves
 from electroadhesive import Screen
 from scipy.signal import butter, hilbert, lfilter, sosfiltfilt
+from strangers_resonator import Resonator
 from test_identify_friction import Screen as StrangersScreen
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
 from hapticrender.control.inverse import FRICTION, FRICTION_NOISE
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
-from hapticrender.plants.identify_friction import identify_screen
+from hapticrender.plants.identify_friction import identify_resonance, identify_screen
 from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
@@ -145,6 +146,34 @@ def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(mu, gain, s
     assert least <= np.std(true - asked) / np.std(asked) < most
 
 
+def friction_errors(device, recording, speed, load):
+    """Errors of the true friction, which is the law's of the true amplitude, and of the inferred, from 0.2 s on."""
+    p, steps = SurfaceParameters(), round(device.rate / recording.rate)
+    amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
+    film = p.friction_coefficient * load * p.friction_law.ratio(amplitude, load, speed)
+    kept = np.exp(-speed / device.rate / p.memory_length)
+    true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
+    band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
+    late = slice(round(0.2 * recording.rate), round(0.4 * recording.rate))
+    signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
+    true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
+    return [np.std(each - reference) / np.std(reference) for each in (true, inferred)]
+
+
+@pytest.mark.parametrize(("speed", "load", "block"), [(0.04, 0.25, 16), (0.08, 0.4, 16), (0.12, 1.0, 4)])
+def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, load, block):
+    """As identified.  Where its force per volt, 10 % less than by the design, is not, the error is larger."""
+    finger, errors = hr.Finger.sliding(speed=speed, normal_load=load, span=0.26), []
+    known = identify_resonance(Resonator(), SurfaceParameters()).profile()
+    for profile in (known, known | {"force_constant": 1.777})[: 1 + (load == 0.4)]:
+        device = Resonator(load=lambda time: load, block=block)
+        fields = {"duration": 0.45, "settle": 0.2, "profile": profile}
+        scene = hr.Scene(texture=white(0.6), finger=finger, device="ultrasonic", **fields)
+        errors.append(friction_errors(device, hr.render(scene, driver=device), speed, load)[0])
+    assert errors[0] < MUST
+    assert errors == sorted(errors)
+
+
 @pytest.mark.parametrize(
     ("speed", "rms", "bound", "off"), [(0.01, 0.5e-6, 0.05, 1.0), (0.1, 3e-6, MUST, 1.0), (0.1, 2e-6, MUST, 1.5)]
 )
@@ -161,16 +190,7 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     recording = hr.render(
         hr.Scene(texture=white(0.6, rms), finger=finger, device="ultrasonic", **fields), driver=device
     )
-    steps = round(192e3 / recording.rate)
-    amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
-    film = p.friction_coefficient * 0.4 * p.friction_law.ratio(amplitude, 0.4, speed)
-    kept = np.exp(-speed / 192e3 / p.memory_length)
-    true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
-    band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
-    late = slice(round(0.2 * recording.rate), round(0.4 * recording.rate))
-    signals = true[: len(recording) - 1], recording.motion[1:, 0], recording.reference[1:]
-    true, inferred, reference = (sosfiltfilt(band, each)[late] for each in signals)
-    right, shown = (np.std(each - reference) / np.std(reference) for each in (true, inferred))
+    right, shown = friction_errors(device, recording, speed, 0.4)
     assert shown < bound
     assert right < bound if off == 1.0 else right > 0.5 - 1.5 * bound
     assert abs(right - shown) < 0.01 or off > 1.0

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from live_devices import Bench
+from strangers_resonator import Resonator, scaled
 
 import hapticrender as hr
 from hapticrender import cli
@@ -14,31 +15,10 @@ from hapticrender.plants.identify_friction import identify_resonance, identify_s
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 
-class Resonator(Bench):
-    """A mode driven in V and sensed in m, exact for a held drive; 2 nm of noise."""
-
-    rate, block, delay, drive_channels, sensed_channels = 192e3, 64, 64, 1, 1
-
-    def __init__(self, frequency=30.1e3, quality=150.0, force=1.6, late=0, seed=0, unit=1.0):
-        w = 2 * np.pi * frequency
-        self.pole = np.exp((-w / (2 * quality) + 1j * w * np.sqrt(1 - 0.25 / quality**2)) / self.rate)
-        s = np.log(self.pole) * self.rate
-        self.push = force / 5e-3 / (2j * s.imag) * (self.pole - 1) / s
-        self.unit, self.state, self.queue, self.rng = unit, 0j, [0.0] * late, np.random.default_rng(seed)
-
-    def play(self, drive):
-        sensed = np.empty((len(drive), 1))
-        for i, u in enumerate(drive[:, 0]):
-            sensed[i] = 2 * self.state.real
-            self.queue.append(u)
-            self.state = self.pole * self.state + self.push * self.queue.pop(0)
-        return hr.Sensed(self.unit * (sensed + 2e-9 * self.rng.standard_normal(sensed.shape)))
-
-
-class Screen(Resonator):
+class Screen(Bench):
     """Friction mu (W + g I^2) over 11.5 um of sliding at 80 mm/s, to and fro; 1 mN of noise, a load that varies."""
 
-    rate, block, delay = 10e3, 10, 10
+    rate, block, delay, drive_channels, sensed_channels = 10e3, 10, 10, 1, 1
 
     def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0, unit=1.0, lateral=False, skin=0.0):
         self.unit, self.lateral, self.skin, self.rough = unit, lateral, skin, 0.0
@@ -112,10 +92,10 @@ def test_too_short_a_slide_is_refused_since_its_intervals_would_be_none():
         (Resonator(force=0.0), "unexplained"),
         (Screen(speed=0.0), "must slide faster than 0.001 m/s"),
         (Screen(gain=-1.5e4), "identified open_loop_gain = -.*: must be a finite number > 0 N"),
-        (Resonator(unit=0.0), "sensed no motion at any line of the drive: check the sensor's connection"),
+        (Resonator(tell=scaled(0.0)), "sensed no motion at any line of the drive: check the sensor's connection"),
         (Resonator(late=2), "sensed 2 samples later than driver.delay = 64 says: must be within 0.5"),
-        (Resonator(unit=-1.0), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
-        (Resonator(unit=1e6), r"sensor 1: \S+ m at sample \d+: must be within \+-2.5e-05 m; check its unit"),
+        (Resonator(tell=scaled(-1.0)), "sensed 3.2 samples (later|earlier) .* half a turn, the sensor may be inverted"),
+        (Resonator(tell=scaled(1e6)), r"sensor 1: \S+ m at sample \d+: must be within \+-2.5e-05 m; check its unit"),
         (Screen(unit=1e3), r"sensor 1: \S+ N at sample \d+: must be within \+-20 N; check its unit"),
     ],
 )
@@ -131,7 +111,7 @@ def test_a_rate_below_twice_the_carrier_is_refused_before_anything_is_played():
     device.rate = 48e3
     with pytest.raises(ValueError, match="rate = 48000 Hz: must be > 61200 Hz, twice the highest line"):
         identify_resonance(device, SurfaceParameters())
-    assert device.state == 0j
+    assert not device.played
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from live_devices import Told
 from scipy.signal import hilbert
+from strangers_resonator import Resonator, scaled
 from tables import scene_on
 from waves import phasor, read_back
 
@@ -16,6 +17,7 @@ from hapticrender.accuracy import friction as accuracy_friction
 from hapticrender.accuracy.suite import TARGETS
 from hapticrender.control import controller_design
 from hapticrender.control.controller import BankController
+from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants import ultrasonic_surface
@@ -169,6 +171,8 @@ def watched(finger=SLIDE, **tell):
         (-1.0, {}, "sensor or actuator is inverted, or the delay"),
         (0.0, {}, "sensor or actuator is dead"),
         (np.nan, {}, "samples of the sensor are no numbers"),
+        (3.0, {}, "sensor or actuator has [23.]* times the gain"),
+        (1 / 3, {}, "sensor or actuator has 0.3[0-9]* times the gain"),
     ],
 )
 def test_a_vibrating_surface_is_probed_on_its_resonance(gain, changes, named, load):
@@ -183,17 +187,29 @@ def test_a_vibrating_surface_is_probed_on_its_resonance(gain, changes, named, lo
     assert abs(np.concatenate(device.moved)).max() < 2e-6
 
 
-def test_a_gain_of_three_is_refused_on_a_free_surface_and_a_scene_may_leave_the_probe_out():
-    """A finger of 0.4 N damps by as much: there it is not distinguished."""
-    tell = lambda sample, sensed: sensed._replace(sensed=3.0 * sensed.sensed, motion=None)  # noqa: E731
-    for finger, refusal in (
-        (FREE, pytest.raises(hr.DeviceFault, match="the vibration is [23.]* times that of the free surface")),
-        (held(0.4), nullcontext()),
-    ):
-        device = watched(finger, tell=tell)
-        device.probe = True
-        with device, refusal:
-            prepare(scene(frequency=200.0), driver=device).probe(device)
+@pytest.mark.parametrize("load", [0.0, 0.4, 15.0])
+@pytest.mark.parametrize("noise", [2e-9, 20e-9])
+@pytest.mark.parametrize("changes", [(0.0, 1.0), (-60.0, 0.5), (60.0, 2.0)])
+def test_a_gain_is_refused_where_it_is_beyond_its_bounds_whatever_the_finger_does(load, noise, changes):
+    """On a surface that shares no code; `changes` of resonance (Hz) and quality.  Noise makes the fit 3 % too small."""
+    off, quality = changes
+    for gain, refusal in ((0.55, "0.5"), (0.65, ""), (1.5, ""), (1.75, "1.[678]")):
+        device = Resonator(30e3 + off, 200.0 * quality, 1.777, load=lambda time: load, tell=scaled(gain), noise=noise)
+        with pytest.raises(hr.DeviceFault, match=f"has {refusal}.* times the gain") if refusal else nullcontext():
+            probe_resonance(device, UltrasonicParameters())
+
+
+@pytest.mark.parametrize(("stated", "fails"), [(475.0, False), (550.0, True)])
+def test_a_quality_more_than_two_and_a_half_times_that_stated_is_refused(stated, fails):
+    device = Resonator(30e3, stated, 1.777)
+    with pytest.raises(hr.DeviceFault, match="0.3[0-9]* of the damping") if fails else nullcontext():
+        probe_resonance(device, UltrasonicParameters())
+
+
+def test_a_scene_may_leave_the_probe_out():
+    device = watched()
+    device.probe = True
+    assert prepare(scene(frequency=200.0), driver=device).probe is not None
     assert prepare(replace(scene(frequency=200.0), rendering={"probe": False}), driver=device).probe is None
 
 

@@ -1,25 +1,28 @@
 """Start-up probe of a vibrating surface: whether its sensor follows its drive, before the loop closes.
 
-For 25 ms the drive is a twentieth of its limit on the resonance w of the free surface; U and Y are the amplitudes of
-drive and sensor over the last 10 ms.  A mode of damping b, d off its resonance, has Y/U = k/(j w b - 2 m w d), so that
+For 25 ms a twentieth of the drive's limit sweeps over the resonance w of the free surface as stated.  Y and U are the
+spectra of sensor and drive, silence included, on the lines W = w + d in that range.  Near the resonance w + s of a mode
+of damping b, whose gain of drive and sensor is g times that stated,
 
-    r = Re(k U/(j w Y))/b_free = (b/b_free)/(gain of drive and sensor over that stated),
+    j d Y = (-b/2m + j s) Y + g k/(2 j m W) U + c,
 
-wherever the resonance is.  A finger damps: r may lie between that of the free surface and that of `MOST_LOAD`.
+where c stands for what rings at the end: three complex unknowns, by linear least squares.  A finger changes b and s,
+and not g.
 """
 
 from typing import Any
 
 import numpy as np
 
-from hapticrender.control.probe import MOST_INVALID, TRIES, play_probe
+from hapticrender.control.probe import MOST_INVALID, SCALES, TRIES, play_probe
 from hapticrender.errors import DeviceFault
 from hapticrender.protocols import Array, Driver
 
-DURATION, EDGE, JUDGED, REST = 25e-3, 5e-3, 10e-3, 15e-3  # s; judged at the end; silence after it
+DURATION, REST = 25e-3, 15e-3  # s; silence after the sweep
 SHARE = 0.05  # of the drive's limit
-LEAST, MOST_GAIN = 0.4, 0.6  # least r: a quality 2.5 times that stated; r of the most damped surface over its gain
-MOST_LOAD = 20.0  # N
+REACH = 0.02  # of the resonance: half the range of the sweep
+DEAD = 0.1  # gain of a dead part, at most
+LEAST = 0.4  # of the damping stated of the free surface: a quality 2.5 times that stated
 
 
 def probe_resonance(driver: Driver, mode: Any) -> None:
@@ -31,7 +34,7 @@ def probe_resonance(driver: Driver, mode: Any) -> None:
     drive = resonance_drive(mode)
     for _ in range(TRIES):
         sensed, lost = play_probe(driver, drive[:, None], 1, REST)
-        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed[: len(drive), 0])
+        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed[:, 0])
         if fault and lost > MOST_INVALID:
             fault = f"{lost:.0%} of the samples were lost on the way: the probe cannot judge"
         if not fault:
@@ -41,29 +44,31 @@ def probe_resonance(driver: Driver, mode: Any) -> None:
 
 
 def resonance_drive(mode: Any) -> Array:
-    """Drive (V, shape (n,)) on the resonance of the free surface, from rest."""
+    """Drive (V, shape (n,)) that sweeps over the resonance of the free surface."""
     time = np.arange(round(DURATION * mode.rate)) / mode.rate
-    edge = np.sin(np.pi / 2 * np.minimum(time / EDGE, 1.0)) ** 2
-    return np.asarray(SHARE * mode.drive_limit * edge * np.cos(2 * np.pi * mode.resonance() * time))
+    turns = float(mode.resonance()) * time * (1.0 - REACH + REACH * time / DURATION)
+    return np.asarray(SHARE * mode.drive_limit * np.cos(2 * np.pi * turns))
 
 
 def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> str:
     """Name what is not as stated in `sensed` (m, shape (n,)), `late` samples behind its drive; "" where nothing is."""
-    rate, omega = mode.rate, 2 * np.pi * float(mode.resonance())
     if not np.all(abs(sensed) < mode.sensor_range):
         return f"samples of the sensor are no numbers, or beyond its range of {mode.sensor_range:g} m"
-    last = np.arange(len(drive) - round(JUDGED * rate), len(drive))
-    turns = np.exp(-1j * omega * last / rate) * np.hanning(len(last))
-    held = np.exp(-1j * omega * (late + 0.5) / rate) * np.sinc(omega / (2 * np.pi * rate))
-    into, found = held * (drive[last] @ turns), sensed[last] @ turns
-    free = float(mode.damping())
-    most = float(mode.damping(MOST_LOAD)) / free / MOST_GAIN
-    expected = mode.force_constant * into / (1j * omega * free)
-    if abs(found) * most <= abs(expected):
-        return f"{abs(found / expected):.2g} of the vibration that it should have: sensor or actuator is dead"
-    damping = float((expected / found).real)
-    if damping < 0.0:
+    resonance, lines = float(mode.resonance()), np.fft.rfftfreq(len(sensed), 1.0 / mode.rate)
+    near = abs(lines - resonance) < REACH * resonance
+    omega, off = 2 * np.pi * lines[near], 2j * np.pi * (lines[near] - resonance)
+    held = np.exp(-1j * omega * (late + 0.5) / mode.rate) * np.sinc(lines[near] / mode.rate)
+    into = mode.force_constant / (2j * mode.mass * omega) * held * np.fft.rfft(drive, len(sensed))[near]
+    found = np.fft.rfft(sensed)[near]
+    terms = np.column_stack([found, into, np.ones(len(found))])
+    pole, gain, _ = np.linalg.lstsq(terms, off * found, rcond=None)[0]
+    damping = -pole.real / (2 * np.pi * float(mode.pole()))
+    if abs(gain) < DEAD:
+        return f"{abs(gain):.2g} of the gain that it should have: sensor or actuator is dead"
+    if gain.real < 0.0:
         return "sensor or actuator is inverted, or the delay is not that stated"
+    if not SCALES[0] <= abs(gain) <= SCALES[1]:
+        return f"sensor or actuator has {abs(gain):.2g} times the gain that it should have"
     if damping < LEAST:
-        return f"the vibration is {1 / damping:.2g} times that of the free surface: gain or quality is not that stated"
+        return f"{damping:.2g} of the damping of the free surface: the quality is not that stated"
     return ""
