@@ -10,7 +10,8 @@ stiffness       the same, then D V + D' dV/dt
 resonant        one integrator a band and coordinate, no low pass; then D V + D' dV/dt
 =============== =======================================================================================================
 
-All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.
+All but h and h2 leave the finger out; docs/theory.md, "Where methods fail", says what that costs.  The name of another
+row belongs into `hapticrender.defaults.METHODS`, too.
 """
 
 import math

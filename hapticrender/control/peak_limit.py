@@ -1,4 +1,4 @@
-"""Compiled end of every controller: the drive inside its limits."""
+"""Compiled end of every controller: the drive inside its limits, rounded to the steps of a converter."""
 
 import math
 
