@@ -147,7 +147,7 @@ def _friction(rendering: Rendering, settings: Any) -> dict[str, Any]:
     """Return the fields of `design_t` that a screen has beside those of a plate."""
     root = rendering.shape
     return {
-        "contact_length": settings["contact_lag"],
+        "contact_length": settings["contact_length"],
         "typical_speed": settings["typical_speed"],
         "least_speed": settings["least_speed"],
         "bias": root.bias,

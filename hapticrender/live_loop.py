@@ -105,7 +105,7 @@ class LiveLoop(RealtimeEntry):
         self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
         own = rendering.plant is not None
         self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
-        self._contact, self._followed = ContactLag(self.model.contact_lag), 0  # of the samples before this one
+        self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
         if self._calls_back and rendering.driver is not rendering.device:
             self.set_root(rendering.shape)
         self.play(self._texture(rendering))
@@ -243,7 +243,7 @@ class LiveLoop(RealtimeEntry):
         true = self._true[(first + np.arange(len(found["flags"]))) % len(self._true)]
         found["normal_load"] = np.where(np.isnan(true[:, -1]), found["normal_load"], true[:, -1])
         stated = {"motion": true[:, :-1]} if self._has_motion else {}
-        contact = self._contact if first == self._followed else ContactLag(self.model.contact_lag)
+        contact = self._contact if first == self._followed else ContactLag(self.model.contact_length)
         motion = motion_of(self.driver, self.model, stated | found, contact)
         if first >= self._followed:
             self._contact, self._followed = contact, first + len(motion)

@@ -294,7 +294,7 @@ class _Loop:
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
-        self._contact = ContactLag(rendering.model.contact_lag)
+        self._contact = ContactLag(rendering.model.contact_length)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
         self._has_motion = False  # whether the device states it
         self._recent = np.zeros(0, int)  # flags

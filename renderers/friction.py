@@ -178,7 +178,7 @@ class FrictionSetup:
     def inferred(self, model: DeviceModel, lag: float) -> DeviceModel:
         """Return `model` where friction is inferred from what follows the drive by a `lag` (s), before the contact."""
         mass, damping, contact = lag**2 / 2 * model.stiffness, lag * model.stiffness, self.assumed.memory_length
-        return replace(model, mass=mass, damping=damping, contact_damping=0.0, contact_lag=contact, inferred=True)
+        return replace(model, mass=mass, damping=damping, contact_damping=0.0, contact_length=contact, inferred=True)
 
 
 def carrier_limit(limits: Limits, most: float, unit: str) -> float:
@@ -210,7 +210,7 @@ class FrictionRenderer(BaseRenderer):
         """
         bands = setup.targets(model)
         setup.check_speed(model, bands)
-        direct = model.sensor_delay == model.contact_lag == 0.0
+        direct = model.sensor_delay == model.contact_length == 0.0
         if direct or bands.envelope is None or (bands.wavenumber > 0.0).any():
             return bands
         return replace(bands, sensor_response=setup.assumed.sensor_response(bands.frequency, setup.speed))

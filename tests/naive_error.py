@@ -143,7 +143,7 @@ class NaiveError:
         heard = np.where(follows, smooth(4 * (edge - f / p["highest"])), 1.0)
         self.share = np.minimum(grown * heard / np.maximum(self.fade, 1e-9), 1.0)
         if p["corrected"] and self.locked:
-            lag = p["contact_lag"] / max(2 * self.speed - self.smooth_speed, 0.1 * p["typical_speed"])
+            lag = p["contact_length"] / max(2 * self.speed - self.smooth_speed, 0.1 * p["typical_speed"])
             self.shown = np.exp(-1j * p["sensor_delay"] * self.w) * (1 + 1j * lag * self.w)
         return carrier
 

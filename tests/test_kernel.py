@@ -42,7 +42,7 @@ def friction_controller(bands):
     changes = {
         "finger": finger,
         "sensor_delay": 1e-4,
-        "contact_lag": 2e-5,
+        "contact_length": 2e-5,
         "contact_damping": 0.05,
         "typical_speed": 0.1,
         "drive_limit": 9.0,
@@ -137,7 +137,7 @@ def test_a_friction_device_is_its_twin(differentiated, rng):
     sensed = pressed(rng, bands, position) * (500.0 if differentiated else 1.0)
     controller = friction_controller(bands)
     agree(controller, sensed, position, np.zeros(2400))
-    names = ("needs_contact", "corrected", "contact_damping", "least_speed", "sensor_delay", "contact_lag")
+    names = ("needs_contact", "corrected", "contact_damping", "least_speed", "sensor_delay", "contact_length")
     assert all(controller.settings[name] > 0 for name in names)
 
 

@@ -121,7 +121,7 @@ def contact_lag(c):
     The speed is that of Brown's double smoothing, without lag under constant acceleration.
     """
     speed = max(2.0 * c.speed - c.smooth_speed, SLOWEST * c.p.typical_speed)
-    return c.p.contact_lag / speed if c.p.contact_lag > 0.0 else 0.0
+    return c.p.contact_length / speed if c.p.contact_length > 0.0 else 0.0
 
 
 @kernel

@@ -43,7 +43,7 @@ BACK_TIME = 0.02  # s: back-calculation at the limit
 TOUCHED_DECAY = 1000.0  # 1/s: of an always damped mode at least
 LEAST_NOISE = 1e-6  # of the sensors' range: thresholds never fall to nothing
 ALWAYS = -1e300  # N: every load is larger
-FROM_MODEL = ("sensor_delay", "contact_lag", "contact_damping", "typical_speed", "drive_step", "highest_edge")
+FROM_MODEL = ("sensor_delay", "contact_length", "contact_damping", "typical_speed", "drive_step", "highest_edge")
 CROWDED = 40.0  # Hz: carriers closer than this share what the detectors see
 
 
@@ -182,7 +182,7 @@ def _settings(
         "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,
         "fade_in": period / max(FADE_IN / model.pace, LEAST_FADE_IN),
-        "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_lag != 0.0),
+        "corrected": bands.sensor_response is None and (model.sensor_delay != 0.0 or model.contact_length != 0.0),
         "lock": 2 * math.pi * model.lock,
         "peak_decay": math.exp(-period * lowest),
         # of an always damped mode about as fast as it loses energy; however little, a finger takes it within 1 ms

@@ -80,7 +80,7 @@ class DeviceModel:
     contact_damping: float = 0.0  # N: part of the first damping that goes as 1/|v|, times v; in `damping` ...
     typical_speed: float = 1.0  # m/s, > 0: ... it is as at this speed of the finger
     sensor_delay: float = 0.0  # s, of the sensor against the evaluation point; negative: a lead
-    contact_lag: float = 0.0  # m: length by which a sliding contact lags behind what the sensor measures
+    contact_length: float = 0.0  # m: length by which a sliding contact lags behind what the sensor measures
     lock: float = 0.0  # Hz, of the resonance lock, which moves fixed carriers to where the device is resonant; 0: none
     taps: int | None = None  # >= 3, of the inner damper without a bending mode; None: as many as reach 0.4 ms back
     always_damped: bool = False  # the damper stays on at low gains: its noise costs less than the onset of a contact

@@ -58,7 +58,7 @@ LOAD_SIZE = (0.6, 0.1)  # N: of the load, and of the moment beside it over a
 def derivative_filters(rate: float, top: float, first: int = 0, count: int = 4, ahead: float = 0.5) -> Array:
     """Filters for derivatives of a signal from the `first` on, `ahead` samples from now, shape (count, TAPS).
 
-    Least squares of ``sum_j c_i[j] exp(j w (j - 5) T) = (j w)^i exp(j w ahead T)`` up to `top` (Hz), with a light
+    Least squares of ``sum_m c_i[m] exp(j w (m - 5) T) = (j w)^i exp(j w ahead T)`` up to `top` (Hz), with a light
     penalty on what lies above.  Half a sample ahead is the middle of the hold, which is undone: over sinc(w T/2).
     """
     offsets, frequency = np.arange(TAPS) - (TAPS // 2 - 1), np.linspace(0.0, top, 400)
@@ -214,7 +214,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         **device_settings(model),
-        "contact_lag": contact_length(model),
+        "contact_length": contact_length(model),
         "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
@@ -260,7 +260,7 @@ def before_contact(model: DeviceModel) -> dict[str, Array]:
 def contact_length(model: DeviceModel) -> float:
     """Length (m) by which a sliding contact lags behind the drive, or behind the sensors where they precede it."""
     behind = model.contact_damping > 0.0
-    return float(model.contact_damping / model.stiffness[0, 0]) if behind else model.contact_lag
+    return float(model.contact_damping / model.stiffness[0, 0]) if behind else model.contact_length
 
 
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
@@ -283,7 +283,7 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     sensor_rate = np.zeros(TAPS)
     if order or late:
         sensor = derivative_filters(float(model.rate), float(top), order, 1, -late)[0]
-    if model.contact_lag > 0.0:
+    if model.contact_length > 0.0:
         sensor_rate = derivative_filters(float(model.rate), float(top), order + 1, 1, -late)[0]
     return {
         "delay": model.delay,

@@ -78,7 +78,7 @@ LOW_PASS, WORK, PAIR = map(_record, (LOW_PASS_FIELDS, WORK_FIELDS, _complex("z")
 
 _SETTINGS = """
 rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated reads_waveform
-needs_contact least_speed sensor_delay contact_lag corrected sensor_limit drive_limit drive_step peak_decay
+needs_contact least_speed sensor_delay contact_length corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high
 detects fast_pole slow_pole fast_threshold slow_threshold fast_time slow_time release
