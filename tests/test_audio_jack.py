@@ -75,7 +75,8 @@ def test_portaudio_is_what_is_declared(connected):
         ),
         ({"device": "no such card"}, DeviceNotFound, "device 'no such card': 0 cards fit: 0 system"),
         ({"rate": 44_100.0}, DriverError, r"plate\?rate=44100: open at 44100 Hz: Invalid sample rate .PortAudio -9997"),
-        ({"latency": "medium"}, ValueError, "latency='medium': must be 'low', 'high' or seconds"),
+        ({"latency": "medium"}, ValueError, "latency='medium': must be 'low', 'high' or 0 to 10 s"),
+        ({"latency": (0.01, -1.0)}, ValueError, r"latency=\(0.01, -1.0\): must be 'low', 'high' or 0 to 10 s"),
     ],
 )
 def test_a_card_refuses_what_it_has_not(connected, options, error, message):
