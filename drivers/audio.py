@@ -84,6 +84,10 @@ class AudioDriver(BaseDriver):
     ) -> None:
         if sensed_channels is None:
             sensed_channels = () if delay is None and sensed_per_full_scale is None else (1, 2)
+        for each in latency if isinstance(latency, tuple | list) else (latency,):
+            seconds = isinstance(each, int | float) and not isinstance(each, bool) and 0.0 <= each <= LONGEST
+            if each not in ("low", "high") and not seconds:
+                raise ValueError(f"{latency=}: must be 'low', 'high' or 0 to {LONGEST:g} s, or a pair of them")
         self.device, self.latency = device, latency
         self.channels, self.inputs = _channels("channels", channels), _channels("sensed_channels", sensed_channels)
         if not self.channels:
@@ -170,9 +174,6 @@ class AudioDriver(BaseDriver):
             raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
         latency = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
         seconds = {"low": own[0], "high": own[1]}.get(latency, latency)
-        if not isinstance(seconds, int | float) or not 0.0 <= seconds <= LONGEST:
-            bound = f"'low', 'high' or 0 to {LONGEST:g} s, or a pair of them"
-            raise ValueError(f"latency={self.latency!r}: must be {bound}")
         return card.index, max(channels), float(seconds)
 
     def _settle(self) -> None:

@@ -45,11 +45,12 @@ class Rows:
     """Rows of a run: drive (A), sensed (m), position (m), load (N), reference (m) and flags.
 
     A row that was lost on the line repeats the one before, with `Flag.OVERRUN`.  `first` is the sample of the board's
-    clock from which on it streams, that of the first row that comes unless given.
+    clock from which on it streams, that of the first row that comes unless given; `stride` the samples between two
+    rows, 0 where none are streamed.
     """
 
-    def __init__(self, first: int | None = None) -> None:
-        self._next, self._stride = first, 1  # sample of the next row, or one up to a stride before it
+    def __init__(self, first: int | None = None, stride: int = 1) -> None:
+        self._next, self._stride = first, stride or 1  # sample of the next row, or one up to a stride before it
         self._rows: list[Array] = []
         self._last: Array | None = None
         self._broken = False  # rows were lost; their number is unknown
@@ -67,8 +68,7 @@ class Rows:
 
     def add(self, block: Stream) -> None:
         """Append the rows of a frame, after those that were lost before it."""
-        rows, self._stride = np.array(block.rows), max(block.stride, 1)
-        missing = self._missing(block.first)
+        rows, missing = np.array(block.rows), self._missing(block.first)
         if missing >= LONGEST_GAP or not len(rows):
             return  # of an earlier run
         if self._broken:
@@ -125,6 +125,7 @@ class BoardClient(OpenedInWith):
     ) -> None:
         self.port, self.clock = port, clock
         self.timeout = number("timeout", timeout, "s", least=0.0)
+        integer("baud", baud, "Bd", least=1)
         self.reconnect = number("reconnect", reconnect, "s", least=0.0)
         self.reconnections = 0
         self.started = 0  # sample of the board's clock at which it last began to play
@@ -252,7 +253,7 @@ class BoardClient(OpenedInWith):
         start = integer("stream", stream, "samples", least=0, most=0xFFFF), period
         integer("telemetry", period, "samples", least=1, most=0xFFFF)
         self.started = self._steadily(lambda line: self._begin(line, start))
-        self._rows = Rows(self.started)
+        self._rows = Rows(self.started, stream)
         self._start, self._runs = start, True
         return self.started
 
@@ -313,7 +314,7 @@ class BoardClient(OpenedInWith):
         require(len(lines) > 0, "lines", lines, "1 or more")
         samples = round(duration * self.capabilities.rate)
         first = self._steadily(lambda line: line.identify(lines, samples, stride=stream))
-        self._runs, self._rows = True, Rows(first)
+        self._runs, self._rows = True, Rows(first, stream)
         columns = self.capabilities.drive_channels + self.capabilities.sensed_channels
         return self.rows(samples // stream)[:, :columns]
 

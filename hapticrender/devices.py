@@ -3,6 +3,7 @@
 import ast
 import errno
 import inspect
+import os
 import warnings
 import weakref
 from collections.abc import Callable, Iterator
@@ -10,7 +11,6 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from importlib.metadata import entry_points
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hapticrender.errors import DriverError, HapticError
@@ -153,16 +153,20 @@ def imported(text: str, module: str, called: str) -> Any:
 
 
 def _split(argument: str, factory: Callable[..., Any]) -> tuple[str, dict[str, Any]]:
-    """Split "0?block=256&channels=3,4" into argument and options of the factory; any other "?" is of the argument."""
+    """Split "0?block=256&channels=3,4" into argument and options of the factory.
+
+    A "?" without names and values behind it, or in the name of a file that is there, is of the argument.
+    """
     before, mark, after = argument.rpartition("?")
     pairs = [each.partition("=") for each in after.split("&")]
-    if not mark or not all(equals for _, equals, _ in pairs) or Path(argument).exists():
+    named = bool(mark) and all(name.isidentifier() and equals for name, equals, _ in pairs)
+    if not named or os.path.exists(argument):
         return argument, {}
     options: dict[str, Any] = {name: value for name, _, value in pairs}
     taken = inspect.signature(factory).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):
-        for name in options.keys() - taken.keys():
-            raise ValueError(f"option {name!r}: must be one of {', '.join(taken)}")
+        for name in options.keys() - list(taken)[1:]:
+            raise ValueError(f"option {name!r}: must be one of {', '.join(list(taken)[1:])}")
     for name, value in options.items():
         with suppress(ValueError, SyntaxError):  # a word
             options[name] = ast.literal_eval(value)

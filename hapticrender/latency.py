@@ -3,9 +3,9 @@
 A burst of random signs x is played and y is sensed; with the cross-spectrum S = Y X* the round trip is the shift s of
 the largest peak of its correlation, and then, to a fraction of a sample, the slope of the phase of S exp(j w s) through
 the origin (least squares, weighted by the magnitude of S, 0.05 to 0.4 of the rate).  With blocks of B samples, and
-`queued` samples that the driver's `play` itself adds, the delay of the device's loop is
+`host_delay` samples that the driver's `play` itself adds, the delay of the device's loop is
 
-    delay = B + s - 1/2 - queued,
+    delay = B + s - 1/2 - host_delay,
 
 for in the loop's models a drive is held for a sample, and so acts half a sample after its number.
 """
@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hapticrender.checks import integer
 from hapticrender.devices import open_driver
 from hapticrender.errors import DriverError
 from hapticrender.loop import opened as open_at_rest
@@ -48,7 +49,7 @@ class Latency:
     trips: tuple[Trip, ...]
     rate: float
     block: int
-    queued: int = 0  # samples that the driver's `play` adds
+    host_delay: int = 0  # samples that the driver's `play` adds
 
     @property
     def spread(self) -> float:
@@ -64,7 +65,7 @@ class Latency:
     @property
     def delay(self) -> float:
         """Delay of the device's loop (samples), the driver's argument `delay`."""
-        return self.block + statistics.median(trip.samples for trip in self.trips) - 0.5 - self.queued
+        return self.block + statistics.median(trip.samples for trip in self.trips) - 0.5 - self.host_delay
 
     def __str__(self) -> str:
         milliseconds = 1e3 * self.delay / self.rate
@@ -85,12 +86,13 @@ def measure_latency(driver: Any, *, runs: int = 5, amplitude: float = 0.1) -> La
     nothing; a DriverError where nothing of what was played is sensed, samples were lost in most of the runs, or the
     runs disagree.
     """
+    integer("runs", runs, least=1)
     if isinstance(driver, str) and (driver := open_driver(text := driver)) is None:
         raise ValueError(f"driver = {text!r}: must be a device with a cable, such as audio:0")
     again = hasattr(driver, "loop_back")  # a new driver for every run
     most = 1.0 if again else getattr(driver, "drive_limit", np.inf)
-    if runs < 1 or not 0 < amplitude < np.inf or amplitude > most:
-        raise ValueError(f"{runs=}, {amplitude=}: must be >= 1, and > 0 and <= {most:g}, the limit of the drive")
+    if not 0 < amplitude < np.inf or amplitude > most:
+        raise ValueError(f"{amplitude=}: must be > 0 and <= {most:g}, the limit of the drive in its unit")
     if not (again or driver.sensed_channels):
         raise ValueError(f"{driver}: senses nothing: a round trip needs an input")
     rng, trips, tries = np.random.default_rng(0), list[Trip](), 0

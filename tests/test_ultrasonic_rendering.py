@@ -206,6 +206,31 @@ def test_a_quality_more_than_two_and_a_half_times_that_stated_is_refused(stated,
         probe_resonance(device, UltrasonicParameters())
 
 
+@pytest.mark.parametrize(("frequency", "late"), [(30e3, 0), (30e3, 1), (20e3, 0), (20e3, 2), (20e3, 5)])
+def test_a_delay_that_turns_the_carrier_is_refused(frequency, late):
+    """By 0, 56, 0, 75 and 188 degrees; the bound is 37."""
+    device, mode = Resonator(frequency, 200.0, 1.777, late=late), UltrasonicParameters(frequency=frequency)
+    with pytest.raises(hr.DeviceFault, match="turned by -?[0-9]+ deg") if late else nullcontext():
+        probe_resonance(device, mode)
+
+
+@pytest.mark.parametrize(
+    ("tries", "shown", "named"),
+    [(2, -1.0, ""), (3, -1.0, "inverted"), (3, np.inf, "no numbers, or beyond its range")],
+)
+def test_a_deviation_in_each_of_three_tries_is_refused(tries, shown, named):
+    """A sensor at a multiple of what it should show in the first `tries`."""
+    tell = lambda sample, sensed: scaled(shown)(sample, sensed) if sample < tries * 0.04 * 192e3 else sensed  # noqa: E731
+    with pytest.raises(hr.DeviceFault, match=named) if named else nullcontext():
+        probe_resonance(Resonator(30e3, 200.0, 1.777, tell=tell), UltrasonicParameters())
+
+
+def test_a_healthy_surface_at_another_carrier_and_rate_is_accepted():
+    device = Resonator(60e3, 200.0, 3.554)
+    device.rate = 400e3
+    probe_resonance(device, UltrasonicParameters(frequency=60e3, force_constant=3.554))
+
+
 def test_a_scene_may_leave_the_probe_out():
     device = watched()
     device.probe = True

@@ -22,6 +22,7 @@ DURATION, REST = 25e-3, 15e-3  # s; silence after the sweep
 SHARE = 0.05  # of the drive's limit
 REACH = 0.02  # of the resonance: half the range of the sweep
 DEAD = 0.1  # gain of a dead part, at most
+STRAIGHT = 0.8  # cosine of the gain's angle, 37 degrees, at least: a sample at 30 of 192 kHz is 56
 LEAST = 0.4  # of the damping stated of the free surface: a quality 2.5 times that stated
 
 
@@ -65,8 +66,11 @@ def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> str:
     damping = -pole.real / (2 * np.pi * float(mode.pole()))
     if abs(gain) < DEAD:
         return f"{abs(gain):.2g} of the gain that it should have: sensor or actuator is dead"
-    if gain.real < 0.0:
-        return "sensor or actuator is inverted, or the delay is not that stated"
+    if gain.real < STRAIGHT * abs(gain):
+        turned = np.degrees(np.angle(gain))
+        return (
+            f"sensor or actuator is inverted, or the delay is not that stated: the gain is turned by {turned:.0f} deg"
+        )
     if not SCALES[0] <= abs(gain) <= SCALES[1]:
         return f"sensor or actuator has {abs(gain):.2g} times the gain that it should have"
     if damping < LEAST:
