@@ -206,9 +206,9 @@ def test_a_quality_more_than_two_and_a_half_times_that_stated_is_refused(stated,
         probe_resonance(device, UltrasonicParameters())
 
 
-@pytest.mark.parametrize(("frequency", "late"), [(30e3, 0), (30e3, 1), (20e3, 0), (20e3, 2), (20e3, 5)])
+@pytest.mark.parametrize(("frequency", "late"), [(30e3, 0), (30e3, 1), (20e3, 0), (20e3, 2), (20e3, 5), (60e3, 0)])
 def test_a_delay_that_turns_the_carrier_is_refused(frequency, late):
-    """By 0, 56, 0, 75 and 188 degrees; the bound is 37."""
+    """By 0, 56, 0, 75, 188 and 0 degrees; the bound is 37, and the hold of half a sample 56 at 60 kHz."""
     device, mode = Resonator(frequency, 200.0, 1.777, late=late), UltrasonicParameters(frequency=frequency)
     with pytest.raises(hr.DeviceFault, match="turned by -?[0-9]+ deg") if late else nullcontext():
         probe_resonance(device, mode)
