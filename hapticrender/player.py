@@ -116,9 +116,7 @@ class Player(Addressed):
         else:
             fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
             self._given, self._scene = None, partial(Scene, device=device, **fields)
-        registered(
-            "renderers", self._scene(texture=ANY).device
-        )  # a kind or a file that is not there is refused at once
+        registered("renderers", self._scene(texture=ANY).device)  # what is not there is refused at once
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
