@@ -42,6 +42,17 @@ def test_a_cluster_gives_the_same(expected):
         assert sweep(SCENES, worst_error, executor=client.get_executor(), at_a_time=2) == expected
 
 
+def test_an_executor_is_handed_so_many_scenes_at_once():
+    class Noting(ThreadPoolExecutor):
+        def map(self, *arguments, chunksize=1, **options):
+            self.chunksize = chunksize
+            return super().map(*arguments, **options)
+
+    with Noting(1) as executor:
+        sweep(SCENES[-1:], worst_error, executor=executor, at_a_time=3)
+    assert executor.chunksize == 3
+
+
 def test_the_method_is_that_of_each_scene_unless_given():
     scenes = [replace(SCENES[-1], method=method) for method in ("h2", "paper")]
     assert [each["method"] for each in sweep(scenes)] == ["h2", "paper"]
