@@ -84,9 +84,10 @@ class AudioDriver(BaseDriver):
     ) -> None:
         if sensed_channels is None:
             sensed_channels = () if delay is None and sensed_per_full_scale is None else (1, 2)
-        for each in latency if isinstance(latency, tuple | list) else (latency,):
+        pair = latency if isinstance(latency, tuple | list) else (latency, latency)
+        for each in pair:
             seconds = isinstance(each, int | float) and not isinstance(each, bool) and 0.0 <= each <= LONGEST
-            if each not in ("low", "high") and not seconds:
+            if len(pair) != 2 or (each not in ("low", "high") and not seconds):
                 raise ValueError(f"{latency=}: must be 'low', 'high' or 0 to {LONGEST:g} s, or a pair of them")
         self.device, self.latency = device, latency
         self.channels, self.inputs = _channels("channels", channels), _channels("sensed_channels", sensed_channels)

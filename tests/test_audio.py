@@ -197,6 +197,7 @@ def test_block_and_rate_are_options_of_the_text():
         ("latency=-1", r"latency=-1: must be 'low', 'high' or 0 to 10 s"),
         ("latency=nan", "latency='nan': must be"),
         ("latency=True", "latency=True: must be"),
+        ("latency=0.1,", r"latency=\(0.1,\): must be"),
         ("block=many", "block='many' must be a whole number >= 1"),
         ("channels=0", r"channels=0: must be different whole numbers >= 1"),
     ):
