@@ -1,7 +1,8 @@
-"""Live play on a device that calls back, on one without a clock of its own, or with another one."""
+"""Live play in real time: on devices that call back, without a clock of their own, or that fail, hang or are slow."""
 
 import threading
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from types import SimpleNamespace
@@ -9,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from live_devices import RIDGES, TONE, Blind, Calling, Lying
+from live_devices import RIDGES, TONE, Blind, Calling, Lying, slide
+from test_player_friction import HANG, KINDS, TEXTURE, failing, unplug
 from test_player_textures import Own
 
 import hapticrender as hr
+import hapticrender.player
 from hapticrender import live_threads
+from hapticrender.bands import Bands
 from hapticrender.plants.plate import Plate, PlateParameters
 
 
@@ -131,3 +135,173 @@ def test_the_finger_of_a_scene_is_sent_to_a_device_that_does_not_sense_it():
     off = abs(played["position"] - scene.finger.position(time))[1000:]
     assert np.median(off) < 1e-3  # a loaded machine sends them late
     assert np.isfinite(played["position"][1000:]).all()
+
+
+class Called(Calling):
+    """A device of `KINDS` whose drive a compiled callback makes, like a sound card's, in blocks of 10."""
+
+    sensed_scale, block, delay = 1.0, 10, 10
+
+    def __init__(self, kind):
+        self.stopping, self.device = threading.Event(), KINDS[kind]().open()
+        self.rate, self.drive_channels = self.device.rate, self.device.drive_channels
+        self.sensed_channels = self.device.sensed_channels
+        self.play(np.zeros((1, self.drive_channels)))  # compiles what real time has no time for
+
+    def play(self, drive):
+        sensed = [self.device.play(each[None]).sensed for each in drive]
+        return hr.Sensed(np.concatenate(sensed))
+
+
+@pytest.mark.parametrize("kind", ["electroadhesion", "hybrid"])
+def test_what_calls_back_runs_the_compiled_controller_behind_a_square_root(kind, tmp_path):
+    """No Python between; a texture that needs twice the bias; and zero drive at the end.
+
+    Where a busy machine keeps the application from setting the finger, friction rests: that only adds to the error.
+    """
+    card = Called(kind)
+    with hr.Player(kind, card) as player:
+        player.finger(-0.05, 0.08, 0.4)
+        player.play(hr.Grating(frequency=100.0, velocity=5e-3))
+        slide(player, 0.6, start=-0.05, speed=0.08)
+        player.play(TEXTURE)
+        slide(player, 0.6, start=-0.002, speed=0.08)
+        player.record(tmp_path / "live.au")
+        errors = [1.0]
+        while errors[-1] >= 0.05 and len(errors) < 8:
+            slide(player, 0.3, start=0.0, speed=0.08)
+            errors += [band.error for band in player.state().bands]
+        recording = player.end_recording()
+        assert player._loop.model.delay == card.block
+    assert min(errors) < 0.05
+    assert recording.header.motion_source == "sensors"
+    assert np.isfinite(recording.motion).all()
+    screen = np.concatenate(card.device.played)[:, -1]
+    assert screen[-1] == 0.0
+    assert screen.min() >= 0.0
+
+
+LOST = hr.DeviceLost, "no answer"
+FAILING = [
+    ("vt-plate", partial(Lying, 0.3, "cut"), hr.ProtocolError, "sensed"),
+    ("vt-plate", partial(Lying, 0.3, "unplugged"), *LOST),
+    *((kind, partial(failing, kind, unplug, HANG), *LOST) for kind in ("electroadhesion", "hybrid")),
+]
+
+
+@pytest.mark.parametrize(("kind", "make", "error", "cause"), FAILING)
+def test_a_driver_that_fails_is_left_without_drive_at_once(kind, make, error, cause):
+    """Before the application has called anything; so is one that is unplugged, where it can be reached again."""
+    device, failed = make(), []
+
+    def hang(player):
+        player.play(TEXTURE)
+        player.finger(0.0, 0.08, 0.4)
+        end = time.monotonic() + 60.0
+        while player._error is None and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        failed.extend(device.played)
+        player.state()
+
+    with pytest.raises(error, match=cause), hr.Player(kind, device) as player:
+        hang(player)
+    assert np.concatenate(failed).any()
+    assert not failed[-1].any()
+
+
+def test_a_watchdog_that_nobody_has_set_runs_in_real_time(monkeypatch):
+    """It begins with the first word of a finger, ends as it lifts, and begins again; without one nothing stops."""
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
+    with hr.Player() as player:
+        player.play(TONE)
+        for _ in range(2):
+            time.sleep(0.8)
+            player.finger(0.0)
+            player.finger(np.nan)
+        player.finger(0.0)
+        end = time.monotonic() + 20.0
+        while player._error is None and time.monotonic() < end:
+            time.sleep(0.02)
+        with pytest.raises(hr.WatchdogTimeout, match=r"for 0\.5 s, the time of its watchdog"):
+            player.state()
+
+
+def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
+    with hr.Player(watchdog=0.2) as player:
+        player.play(TONE)
+        with player._lock, player._busy():
+            time.sleep(0.5)
+        player.sleep(0.1)
+        end = time.monotonic() + 20.0
+        while not player._loop.timed_out and time.monotonic() < end:
+            time.sleep(0.02)
+        assert player._loop.timed_out
+        while player._error is None and time.monotonic() < end:  # until it is at rest, and seen
+            time.sleep(0.02)
+        with pytest.raises(hr.WatchdogTimeout):
+            player.finger(0.0)
+
+
+def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch):
+    """Zero drive cannot be played through it: the user is told; a driver that returns is closed without a word."""
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
+    stuck = threading.Event()
+
+    class Hanging(Lying):
+        def _play(self, drive):
+            if self.count > 1000:
+                stuck.wait(60.0)
+            return super()._play(drive)
+
+    def play(player):
+        player.play(TONE)
+        with pytest.raises(hr.HapticError, match="has played no sample"):
+            player.sleep(10.0)
+
+    trouble = r"has not returned for 0\.5 s: zero drive could not be played"
+    with pytest.raises(hr.DriverError, match=trouble), hr.Player(driver=Hanging(1e9, "")) as player:
+        play(player)
+    stuck.set()
+
+
+class Lengthy:
+    """A tone of one's own; once it is live it takes `share` s to compute for a second of it, or waits for `ready`."""
+
+    spatial, live, share = False, False, 0.0
+
+    def __init__(self, ready=None):
+        self.ready = ready
+
+    def bands(self, rate):
+        return Bands.none(spatial=False)
+
+    def waveform(self, time, position):
+        if self.live:
+            threading.Event().wait(self.share * (np.max(time) - np.min(time)))
+            if self.ready is not None:
+                self.ready.wait(60.0)
+        return 5e-6 * np.sin(2 * np.pi * 100.0 * time)
+
+
+@pytest.mark.parametrize(("share", "hangs"), [(0.3, False), (4.0, False), (0.0, True)])
+def test_a_texture_that_is_slower_than_the_clock_is_named_and_the_device_closed(share, hangs, monkeypatch):
+    """Whether it is slow or hangs in the end, the driver plays every block; one that takes 0.3 s a second is well."""
+    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
+    ready, closed = threading.Event(), []
+
+    class Closing(Lying):
+        def __exit__(self, *error):
+            closed.append(abs(self.played[-1]).max())
+            return super().__exit__(*error)
+
+    texture = Lengthy(ready if hangs else None)
+    named = pytest.raises(hr.HapticError, match="Lengthy: 0.25 s of it took .* times as long as it lasts")
+    with nullcontext() if share == 0.3 else named as caught, hr.Player(driver=Closing(1e9, "")) as player:
+        player.play(texture)
+        texture.share, texture.live = share, True
+        player.sleep(3.5)
+        player.state()
+    ready.set()
+    assert closed == [0.0]
+    assert caught is None or type(caught.value) is hr.HapticError  # and not the driver's

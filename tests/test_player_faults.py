@@ -16,16 +16,9 @@ from other_plate import OtherPlate
 import hapticrender as hr
 import hapticrender.player
 from benchmarks import faults
-from hapticrender.bands import Bands
 from hapticrender.cli import main
 from hapticrender.process_signals import Terminated
 from hapticrender.recordings.recording import Recording
-
-
-def go_on(player):
-    player.play(TONE)
-    for _ in range(200):
-        player.sleep(0.05)
 
 
 def fail(player):
@@ -74,39 +67,6 @@ def test_an_application_that_hangs_while_a_finger_touches_is_stopped(finger, wat
         player._advance(0.7)
         with pytest.raises(hr.WatchdogTimeout, match=f"stopped at {stopped}") if stopped else nullcontext():
             player.sleep(0.7)
-
-
-def test_a_watchdog_that_nobody_has_set_runs_in_real_time(monkeypatch):
-    """It begins with the first word of a finger, ends as it lifts, and begins again; without one nothing stops."""
-    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
-    with hr.Player() as player:
-        player.play(TONE)
-        for _ in range(2):
-            time.sleep(0.8)
-            player.finger(0.0)
-            player.finger(np.nan)
-        player.finger(0.0)
-        end = time.monotonic() + 20.0
-        while player._error is None and time.monotonic() < end:
-            time.sleep(0.02)
-        with pytest.raises(hr.WatchdogTimeout, match=r"for 0\.5 s, the time of its watchdog"):
-            player.state()
-
-
-def test_the_watchdog_runs_in_real_time_and_waits_for_calls_that_take_long():
-    with hr.Player(watchdog=0.2) as player:
-        player.play(TONE)
-        with player._lock, player._busy():
-            time.sleep(0.5)
-        player.sleep(0.1)
-        end = time.monotonic() + 20.0
-        while not player._loop.timed_out and time.monotonic() < end:
-            time.sleep(0.02)
-        assert player._loop.timed_out
-        while player._error is None and time.monotonic() < end:  # until it is at rest, and seen
-            time.sleep(0.02)
-        with pytest.raises(hr.WatchdogTimeout):
-            player.finger(0.0)
 
 
 def test_a_recording_says_that_an_error_ended_it(tmp_path):
@@ -203,90 +163,6 @@ def test_sensors_that_are_swapped_on_the_middle_are_found_late_where_the_finger_
     zero, motion = moved_after(plate)
     assert zero > 0.4
     assert motion < 1.25e-3
-
-
-def test_a_device_that_is_unplugged_is_an_error_at_the_next_call():
-    driver = Lying(0.3, "unplugged")
-    with pytest.raises(hr.DeviceLost, match="no answer"), hr.Player(driver=driver) as player:
-        go_on(player)
-    assert abs(driver.played[-1]).max() == 0.0
-
-
-def test_a_driver_that_fails_is_left_at_zero_drive_at_once():
-    """Before the application has called anything."""
-    driver = Lying(0.3, "cut")
-
-    def hang(player):
-        player.play(TONE)
-        end = time.monotonic() + 20.0
-        while player._error is None and time.monotonic() < end:
-            time.sleep(0.01)
-        time.sleep(0.1)
-        assert abs(driver.played[-1]).max() == 0.0
-        assert abs(np.concatenate(driver.played)).max() > 0.0
-
-    with pytest.raises(hr.ProtocolError, match="sensed"), hr.Player(driver=driver) as player:
-        hang(player)
-
-
-def test_a_driver_that_does_not_return_ends_in_an_error_that_says_so(monkeypatch):
-    """Zero drive cannot be played through it: the user is told; a driver that returns is closed without a word."""
-    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
-    stuck = threading.Event()
-
-    class Hanging(Lying):
-        def _play(self, drive):
-            if self.count > 1000:
-                stuck.wait(60.0)
-            return super()._play(drive)
-
-    trouble = r"has not returned for 0\.5 s: zero drive could not be played"
-    with pytest.raises(hr.DriverError, match=trouble), hr.Player(driver=Hanging(1e9, "")) as player:
-        with pytest.raises(hr.HapticError, match="has played no sample"):
-            go_on(player)
-    stuck.set()
-
-
-class Slow:
-    """A tone of one's own; once it is live it takes `share` s to compute for a second of it, or waits for `ready`."""
-
-    spatial, live, share = False, False, 0.0
-
-    def __init__(self, ready=None):
-        self.ready = ready
-
-    def bands(self, rate):
-        return Bands.none(spatial=False)
-
-    def waveform(self, time, position):
-        if self.live:
-            threading.Event().wait(self.share * (np.max(time) - np.min(time)))
-            if self.ready is not None:
-                self.ready.wait(60.0)
-        return 5e-6 * np.sin(2 * np.pi * 100.0 * time)
-
-
-@pytest.mark.parametrize(("share", "hangs"), [(0.3, False), (4.0, False), (0.0, True)])
-def test_a_texture_that_is_slower_than_the_clock_is_named_and_the_device_closed(share, hangs, monkeypatch):
-    """Whether it is slow or hangs in the end, the driver plays every block; one that takes 0.3 s a second is well."""
-    monkeypatch.setattr(hapticrender.player, "TIMEOUT", 0.5)
-    ready, closed = threading.Event(), []
-
-    class Closing(Lying):
-        def __exit__(self, *error):
-            closed.append(abs(self.played[-1]).max())
-            return super().__exit__(*error)
-
-    texture = Slow(ready if hangs else None)
-    named = pytest.raises(hr.HapticError, match="Slow: 0.25 s of it took .* times as long as it lasts")
-    with nullcontext() if share == 0.3 else named as caught, hr.Player(driver=Closing(1e9, "")) as player:
-        player.play(texture)
-        texture.share, texture.live = share, True
-        player.sleep(3.5)
-        player.state()
-    ready.set()
-    assert closed == [0.0]
-    assert caught is None or type(caught.value) is hr.HapticError  # and not the driver's
 
 
 @pytest.mark.parametrize("calls_back", [True, False])

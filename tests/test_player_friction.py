@@ -2,13 +2,11 @@
 
 import copy
 import signal
-import threading
-import time
 
 import numpy as np
 import pytest
 from electroadhesive import Screen
-from live_devices import Calling, slide
+from live_devices import slide
 from test_hybrid import bench
 from test_ultrasonic_rendering import watched
 
@@ -52,49 +50,6 @@ def test_a_screen_on_a_card_is_designed_for_the_delay_of_play():
         [band] = player.state().bands
         assert player._loop.model.delay == 4 * 26
     assert band.error < 0.05
-
-
-class Called(Calling):
-    """A device of `KINDS` whose drive a compiled callback makes, like a sound card's, in blocks of 10."""
-
-    sensed_scale, block, delay = 1.0, 10, 10
-
-    def __init__(self, kind):
-        self.stopping, self.device = threading.Event(), KINDS[kind]().open()
-        self.rate, self.drive_channels = self.device.rate, self.device.drive_channels
-        self.sensed_channels = self.device.sensed_channels
-
-    def play(self, drive):
-        sensed = [self.device.play(each[None]).sensed for each in drive]
-        return hr.Sensed(np.concatenate(sensed))
-
-
-@pytest.mark.parametrize("kind", ["electroadhesion", "hybrid"])
-def test_what_calls_back_runs_the_compiled_controller_behind_a_square_root(kind, tmp_path):
-    """No Python between; a texture that needs twice the bias; and zero drive at the end.
-
-    Where a busy machine keeps the application from setting the finger, friction rests: that only adds to the error.
-    """
-    card = Called(kind)
-    with hr.Player(kind, card) as player:
-        player.finger(-0.05, 0.08, 0.4)
-        player.play(hr.Grating(frequency=100.0, velocity=5e-3))
-        slide(player, 0.6, start=-0.05, speed=0.08)
-        player.play(TEXTURE)
-        slide(player, 0.6, start=-0.002, speed=0.08)
-        player.record(tmp_path / "live.au")
-        errors = [1.0]
-        while errors[-1] >= 0.05 and len(errors) < 8:
-            slide(player, 0.3, start=0.0, speed=0.08)
-            errors += [band.error for band in player.state().bands]
-        recording = player.end_recording()
-        assert player._loop.model.delay == card.block
-    assert min(errors) < 0.05
-    assert recording.header.motion_source == "sensors"
-    assert np.isfinite(recording.motion).all()
-    screen = np.concatenate(card.device.played)[:, -1]
-    assert screen[-1] == 0.0
-    assert screen.min() >= 0.0
 
 
 def unplug(sensed):
@@ -165,24 +120,3 @@ def test_what_ends_an_application_leaves_the_device_itself_without_drive(kind, e
     after = np.concatenate(device.played[len(before) :])
     assert 0 < len(after) <= ZERO * device.rate
     assert not after[-1].any()
-
-
-@pytest.mark.parametrize("kind", ["electroadhesion", "hybrid"])
-def test_a_driver_that_fails_is_left_without_drive_at_once(kind):
-    """Before the application has called anything; so is one that is unplugged, where it can be reached again."""
-    device = failing(kind, unplug, HANG)
-    failed = []
-
-    def hang(player):
-        player.play(TEXTURE)
-        player.finger(0.0, 0.08, 0.4)
-        end = time.monotonic() + 60.0
-        while player._error is None and time.monotonic() < end:
-            time.sleep(0.01)
-        time.sleep(0.1)
-        failed.extend(device.played)
-        player.state()
-
-    with pytest.raises(hr.DeviceLost, match="no answer"), hr.Player(kind, device) as player:
-        hang(player)
-    assert not failed[-1].any()
