@@ -117,7 +117,7 @@ def moved_after(plate):
 
 
 SWAPS = [  # frequency, load, and bounds of time (s) and motion (m): a tone more than before, or docs/safety.md's 1.2 mm
-    *((frequency, load, 6e-3, 100e-6) for frequency, load in ((20.0, 0.8), (72.0, 2.0), (189.0, 0.8))),
+    *((frequency, load, 6e-3, 100e-6) for frequency, load in ((20.0, 0.8), (189.0, 0.8))),
     (400.0, 0.8, 0.2, 1.25e-3),
 ]
 
@@ -137,7 +137,7 @@ def test_sensors_that_are_swapped_live_stop_the_drive_under_a_finger_off_the_mid
     assert motion < most
 
 
-@pytest.mark.parametrize(("frequency", "load"), [(20.0, 2.0), (72.0, 0.8), (189.0, 2.0), (400.0, 0.8)])
+@pytest.mark.parametrize(("frequency", "load"), [(20.0, 2.0), (400.0, 0.8)])
 def test_sensors_that_are_swapped_live_under_a_finger_on_the_middle_do_little(frequency, load):
     """Their mean is the heave still, and each shows the true size of an end's motion.
 
@@ -150,7 +150,7 @@ def test_sensors_that_are_swapped_live_under_a_finger_on_the_middle_do_little(fr
     assert moved_after(plate)[1] < 2 * 50e-6
 
 
-@pytest.mark.parametrize(("frequency", "stops"), [(20.0, False), (72.0, False), (189.0, True), (400.0, True)])
+@pytest.mark.parametrize(("frequency", "stops"), [(72.0, False), (189.0, True)])
 def test_sensors_that_are_swapped_on_the_middle_are_found_late_where_the_finger_slides_off(frequency, stops):
     """What docs/safety.md says: after 0.4 s or not, and within the 1.2 mm that bound a swap elsewhere.
 
@@ -193,24 +193,6 @@ def test_a_device_that_is_being_opened_when_the_application_leaves_is_closed(cal
     assert player._loop.samples == played
 
 
-def test_a_disk_that_fails_ends_the_recording_and_not_the_play(tmp_path, monkeypatch):
-    with hr.Player(paced=False) as player:
-        player.play(TONE)
-        with pytest.raises(FileNotFoundError):
-            player.record(tmp_path / "nowhere" / "a.au")
-        player.record(tmp_path / "a.au")
-        player.sleep(0.5)
-
-        def full(**signals):
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(player._recorder, "append", full)
-        player.sleep(0.5)
-        assert player.state().bands[0].error < 0.02
-        with pytest.raises(OSError, match="No space left"):
-            player.end_recording()
-
-
 @contextmanager
 def full_disk(size):
     """Files of this process may not grow beyond `size` bytes: writing is then an `OSError`, as on a full disk."""
@@ -242,6 +224,9 @@ def test_a_recording_that_a_full_disk_cuts_off_is_an_error_once(tmp_path):
     with full, hr.Player(paced=False) as player:
         record_onto_a_full_disk(player, tmp_path / "with.au")
     with hr.Player(paced=False) as player:
+        player.play(TONE)
+        with pytest.raises(FileNotFoundError):
+            player.record(tmp_path / "nowhere" / "a.au")
         record_onto_a_full_disk(player, tmp_path / "ended.au")
         with full:
             player.end_recording()
