@@ -22,7 +22,6 @@ DEVICES = {
     "electroadhesion": lambda finger, tell: Screen(blind=False, finger=finger, tell=tell),
 }
 FAULTS = {  # what is sensed instead of `sensed`, of which `last` was the last sample
-    "healthy": lambda sensed, last, rng: sensed,
     "frozen": lambda sensed, last, rng: np.broadcast_to(last, sensed.shape),
     "dead": lambda sensed, last, rng: 0.0 * sensed,
     "no numbers": lambda sensed, last, rng: np.nan * sensed,
@@ -103,10 +102,9 @@ def test_a_sensor_that_fails_is_stopped(kind, fault, within, cause):
         assert after < before + slope * (found.time - START + ZERO / 10)
 
 
-@pytest.mark.parametrize("fault", ["healthy", "inverted"])
-def test_a_tribometer_that_is_inverted_is_not_stopped(fault):
+def test_a_tribometer_that_is_inverted_is_not_stopped():
     """Friction is a magnitude: the sign of what is sensed is that of the finger's direction."""
-    device, recording, found = run("electroadhesion", fault)
+    device, recording, found = run("electroadhesion", "inverted")
     assert found is None
     assert recording.summary()["verdict"] == "passed"
     before, after = largest(device.played, device.rate)
@@ -208,12 +206,3 @@ def play_steps(tell):
     assert device.rate == 10e3
     texture = hr.Grating(frequency=400.0, velocity=40e-3)
     hr.render(hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=0.4), driver=device)
-
-
-def test_a_healthy_ultrasonic_surface_is_not_stopped():
-    device, recording, found = run("resonator", "healthy")
-    assert found is None
-    assert not (recording.flags & hr.Flag.STOPPED).any()
-    for blocks in (device.played, device.moved):
-        before, after = largest(blocks, device.rate)
-        assert after == pytest.approx(before, rel=0.01)
