@@ -19,7 +19,7 @@ from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.drivers.protocol import Capabilities
+from hapticrender.drivers.protocol import Capabilities, Telemetry
 from hapticrender.errors import DeviceFault, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Controller, DeviceLoop, Flag, Rendering, Sensed
 
@@ -143,6 +143,11 @@ class SerialDriver(BaseDriver):
             rms, time = math.sqrt(2.0) * limits.rms_drive, limits.rms_time  # the board's is that of the carrier's peak
         self.client.limits(peak, min(rms, peak), min(time, LONGEST_MEAN), model.sensed_bound)
 
+    @property
+    def learned(self) -> Telemetry:
+        """What the board's law has learned of its device, as `hapticrender.loop.differences` takes it."""
+        return self.client.telemetry()
+
     def _point(self) -> None:
         if self.finger is None:
             return
@@ -238,6 +243,11 @@ class BoardLoop:
             self.flags |= Flag.STOPPED
             return fault
         return None
+
+    @property
+    def learned(self) -> Telemetry | None:
+        """What the board's law has learned of its device, unless that was stopped."""
+        return None if self.flags & Flag.STOPPED else self.driver.learned
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""

@@ -157,9 +157,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         if fault:
             fault.recording = recorder.finish()
             raise fault
+        compared = differences(rendering, getattr(device, "learned", loop.controller))
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
-    recording.warnings = differences(rendering, loop.controller)
+    recording.warnings = compared
     warn_of(recording.warnings, recording)
     return recording
 
@@ -385,8 +386,8 @@ class _Loop:
         return {"motion": motion, "motion_source": motion_source(driver, model, "motion" in signals)}
 
 
-def differences(rendering: Rendering, controller: Controller) -> tuple[str, ...]:
-    """State where a device differs from its model, by what a controller has learned on it."""
+def differences(rendering: Rendering, controller: object) -> tuple[str, ...]:
+    """State where a device differs from its model, by what a controller, or its telemetry, has learned on it."""
     scale, mismatch = getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
     source, messages = rendering.scene.source, []
     if scale < 1.0:

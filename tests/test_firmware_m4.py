@@ -54,7 +54,7 @@ def test_law_and_board_need_no_heap_no_output_and_no_double_on_a_cortex_m4(expor
 
 @pytest.mark.parametrize(
     ("device", "bands"),
-    [({}, 8), ({}, 64), ({"coils": 1}, 9), ({"delay": 3}, 8), ({"rate": 48e3, "delay": 40}, 8), (SCREEN, 8)],
+    [({}, 8), ({}, 9), ({}, 64), ({"coils": 1}, 9), ({"delay": 3}, 8), ({"rate": 48e3, "delay": 40}, 8), (SCREEN, 8)],
 )
 def test_the_memory_of_a_board_is_what_design_h_states(tmp_path, device, bands):
     """To the byte on a Cortex-M4, and with other textures; a board that takes more does not compile."""
