@@ -5,6 +5,7 @@ behind the driver protocol, so that ``hapticrender.render`` plays a scene on the
 The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's part.
 """
 
+import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -51,6 +52,9 @@ class SerialDriver(BaseDriver):
     device_kind: str  # of which the firmware has the law
 
     def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
+        known = list(inspect.signature(BoardClient).parameters)[1:]
+        for name in options.keys() - known:
+            raise TypeError(f"option {name!r} of SerialDriver: must be one of finger, {', '.join(known)}")
         self.client = BoardClient(port, **options)
         self.finger, self._begun, self._last = finger, False, np.full(1, np.nan)
         self._started = math.inf  # s, of the client's clock

@@ -29,5 +29,8 @@ def scenes_of(device: str | Scene, finger: Finger | None, tables: Mapping[str, A
         scenes = partial(replace, replace(device, finger=finger or device.finger, **tables))
     else:
         scenes = partial(Scene, **{"device": device, "finger": finger or NOMINAL, "duration": LONGEST, **tables})
-    registered("renderers", scenes(texture=ANY).device)
+    scene = scenes(texture=ANY)
+    renderer = registered("renderers", scene.device)()
+    if hasattr(renderer, "check"):
+        renderer.check(scene)
     return scenes

@@ -218,7 +218,8 @@ class Renderer(Protocol):
     def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
         """Open a scene on the device behind `driver`, or on the simulated one; read its tables once, check everything.
 
-        A ValueError or TypeError where the scene requests what the device cannot do.
+        A ValueError or TypeError where the scene requests what the device cannot do.  What of that no texture could
+        change, ``check(scene)`` may refuse (optional), which `hapticrender.Player` calls where it is made.
         """
         ...
 

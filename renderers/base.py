@@ -78,6 +78,11 @@ class BaseRenderer:
             probe=self.probe(setup, model, device),
         )
 
+    def check(self, scene: Scene) -> None:
+        """Refuse a method or an entry of the tables with which no texture could be played; `open` refuses the rest."""
+        method_named(scene.method)
+        self.read(scene, None)
+
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
         """Return the setup: what the scene's tables say, in the form that the other parts take."""
         return scene

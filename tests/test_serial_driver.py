@@ -25,6 +25,7 @@ from board import (
 
 import hapticrender as hr
 from hapticrender.cli import main
+from hapticrender.devices import open_driver
 from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind, Reason, State
 from hapticrender.drivers.serial import BoardClient, Line, SerialDriver
@@ -277,6 +278,21 @@ def test_a_run_goes_on_with_a_flag_after_its_board_was_lost(fast):
     before = slice(round(0.2 * RATE), round(0.4 * RATE))
     error = recording.read("sensed")[before].mean(axis=1) - recording.read("reference")[before].ravel()
     assert np.sqrt((error**2).mean()) < 0.5 * 5e-6 / np.sqrt(2)  # in phase: noise of 1 um in two sensors, 0.2 of it
+
+
+def test_a_misspelt_option_names_the_driver_and_its_options():
+    """Before the port is opened; a right one is taken."""
+    for text, error, message in (
+        (
+            "bau=9600",
+            ValueError,
+            "driver = 'serial:no-such-port.bau=9600': option 'bau' of SerialDriver: must be one of "
+            "finger, baud, timeout, reconnect, .*; give its argument as serial:ARGUMENT.OPTION=VALUE",
+        ),
+        ("baud=9600", DeviceNotFound, "no-such-port: open"),
+    ):
+        with pytest.raises(error, match=message):
+            open_driver(f"serial:no-such-port?{text}")
 
 
 def test_nothing_there_and_nothing_that_answers(tmp_path):
