@@ -64,7 +64,8 @@ def prepare(
     refuse_to_overwrite(scene.texture, getattr(driver, "path", None))
     kind = getattr(driver, "device_kind", scene.device)
     if kind != scene.device:
-        raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it, and plays nothing else")
+        cure = "export this scene to it, or take another driver"
+        raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it: {cure}")
     renderer = registered("renderers", scene.device)() if renderer is None else renderer
     if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
         kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__

@@ -10,8 +10,9 @@ from board import FIRMWARE, ROOT, SOURCES, compile_c
 from laws import FINGERS, PARTS, RATE
 
 import hapticrender as hr
-from hapticrender.export import SCREEN, export
+from hapticrender.export import export
 
+SCREEN = "electroadhesion"
 CROSS, QEMU = "arm-none-eabi-gcc", "qemu-system-arm"
 M4 = "-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
 SIZE = '#include <stdio.h>\n#include "law.h"\nint main(void) { return printf("%zu", sizeof(law_t)) < 0; }\n'
