@@ -111,7 +111,6 @@ class SerialDriver(BaseDriver):
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
                 self._begun = True
-                self._point()
                 loop.start()
                 self._started = self.client.clock.monotonic()
             found = self.signals(self.client.rows(count, self._point))
@@ -156,7 +155,7 @@ class SerialDriver(BaseDriver):
         if self.finger is None:
             return
         clock = self.client.clock.monotonic()
-        now = np.array([0.0, 1e-4]) + max(clock - self._started, 0.0)
+        now = np.array([0.0, 1e-4]) + clock - self._started
         here, there = self.finger.position(now)
         velocity = (there - here) * 1e4
         self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self.finger.load(now[:1])[0], clock)
