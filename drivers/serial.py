@@ -8,7 +8,7 @@ The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's par
 import inspect
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from typing import Any
 
@@ -147,9 +147,11 @@ class SerialDriver(BaseDriver):
         self.client.limits(peak, min(rms, peak), min(time, LONGEST_MEAN), model.sensed_bound)
 
     @property
-    def learned(self) -> Telemetry:
-        """What the board's law has learned of its device, as `hapticrender.loop.differences` takes it."""
-        return self.client.telemetry()
+    def learned(self) -> Telemetry | None:
+        """What the board's law has learned of its device, as `hapticrender.loop.differences` takes it; None: lost."""
+        with suppress(HapticError):  # what was played before stays
+            return self.client.telemetry()
+        return None
 
     def _point(self) -> None:
         if self.finger is None:

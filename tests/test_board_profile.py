@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 
+import numpy as np
 import pytest
 from board import SLOW, BoardProcess, SlowClock, SteppedBoard, build_board
 
@@ -42,6 +43,10 @@ def test_a_profile_that_the_board_contradicts_is_named_by_render_and_live(profil
             driver.client.finger(0.0, 0.0, 0.4)
             board.run(driver.client, 0.1)
             assert loop.learned.mismatch == 0.0  # it is touched
+            board.pulled = np.inf
+            with pytest.raises(hr.DeviceLost):
+                board.run(driver.client, 0.6)
+            assert loop.learned is None
 
 
 def test_a_player_names_the_profile_that_its_board_contradicts(profiled, tmp_path):
