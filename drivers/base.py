@@ -46,6 +46,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     of a device with a controller of its own: what it plays live, like ``hapticrender.live_loop.LiveLoop``
 ``device_loop(controller)`` (optional)
     a whole closed loop of its own, sample by sample; see ``protocols.DeviceLoop``
+``learned`` (optional)
+    of an open device with a controller of its own: what `hapticrender.loop.differences` takes, as `mismatch`
 ``found()`` (optional, class method)
     list of str: the devices that are there now, each as the driver's argument, two spaces, and what it can do; shown
     by ``hapticrender devices``

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from hapticrender.protocols import Flag
 
-VERSION = 5
+VERSION = 6
 MOST_BODY = 254  # bytes of kind, sequence, payload and CRC: one COBS group at most
 MOST_PAYLOAD = MOST_BODY - 5
 CRC_START = 0xFFFF
@@ -66,7 +66,7 @@ LAYOUT = {  # payloads, without the check value of commands; some go on with row
     Kind.CAPABILITIES: "<BIIfffIHHBBBBBHHBB",
     Kind.ACK: "<BI",  # kind; sample
     Kind.REFUSE: "<BBI",  # kind; reason; sample
-    Kind.TELEMETRY: "<IIIIBBHIIIIIfIBB",
+    Kind.TELEMETRY: "<IIIIBBHIIIIIfIffBB",
     Kind.STREAM: "<IH",  # sample of the first row; samples between rows; then the rows
 }
 BAND = struct.Struct("<ffff")  # of TELEMETRY: target re, im; measured re, im (m)
@@ -172,6 +172,8 @@ class Telemetry(NamedTuple):
     dropped: int  # frames not sent, as the line was full
     position: float  # m, of the finger; NaN: none
     commits: int
+    mismatch: float  # force learned on the untouched device over that of its model, 0: not known; see `differences`
+    damper_scale: float  # of the inner damper, 1 unless the supervisor has turned it down
     first: int  # number of the first band here
     total: int  # bands that play
     bands: tuple[BandTelemetry, ...]

@@ -5,9 +5,10 @@ behind the driver protocol, so that ``hapticrender.render`` plays a scene on the
 The protocol is in ``docs/protocol.md``; ``drivers/firmware`` is the board's part.
 """
 
+import inspect
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import copy
 from typing import Any
 
@@ -19,7 +20,7 @@ from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.drivers.protocol import Capabilities
+from hapticrender.drivers.protocol import Capabilities, Telemetry
 from hapticrender.errors import DeviceFault, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Controller, DeviceLoop, Flag, Rendering, Sensed
 
@@ -51,6 +52,9 @@ class SerialDriver(BaseDriver):
     device_kind: str  # of which the firmware has the law
 
     def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
+        known = list(inspect.signature(BoardClient).parameters)[1:]
+        for name in options.keys() - known:
+            raise TypeError(f"option {name!r} of SerialDriver: must be one of finger, {', '.join(known)}")
         self.client = BoardClient(port, **options)
         self.finger, self._begun, self._last = finger, False, np.full(1, np.nan)
         self._started = math.inf  # s, of the client's clock
@@ -107,7 +111,6 @@ class SerialDriver(BaseDriver):
         def advance(count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
             if not self._begun:
                 self._begun = True
-                self._point()
                 loop.start()
                 self._started = self.client.clock.monotonic()
             found = self.signals(self.client.rows(count, self._point))
@@ -143,11 +146,18 @@ class SerialDriver(BaseDriver):
             rms, time = math.sqrt(2.0) * limits.rms_drive, limits.rms_time  # the board's is that of the carrier's peak
         self.client.limits(peak, min(rms, peak), min(time, LONGEST_MEAN), model.sensed_bound)
 
+    @property
+    def learned(self) -> Telemetry | None:
+        """What the board's law has learned of its device, as `hapticrender.loop.differences` takes it; None: lost."""
+        with suppress(HapticError):  # what was played before stays
+            return self.client.telemetry()
+        return None
+
     def _point(self) -> None:
         if self.finger is None:
             return
         clock = self.client.clock.monotonic()
-        now = np.array([0.0, 1e-4]) + max(clock - self._started, 0.0)
+        now = np.array([0.0, 1e-4]) + clock - self._started
         here, there = self.finger.position(now)
         velocity = (there - here) * 1e4
         self.client.finger(here, velocity if np.isfinite(velocity) else 0.0, self.finger.load(now[:1])[0], clock)
@@ -238,6 +248,11 @@ class BoardLoop:
             self.flags |= Flag.STOPPED
             return fault
         return None
+
+    @property
+    def learned(self) -> Telemetry | None:
+        """What the board's law has learned of its device, unless that was stopped."""
+        return None if self.flags & Flag.STOPPED else self.driver.learned
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Return the number of the first sample and the signals that the board has streamed since the last call."""

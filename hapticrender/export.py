@@ -25,9 +25,8 @@ BANDS = 8  # of a board at least: set-points may need more than the scene does
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
-BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 24, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES, PAST_BYTES = 12_640, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
-SCREEN = "electroadhesion"
+BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
+OTHER_BYTES, PAST_BYTES = 12_636, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
@@ -60,7 +59,7 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
     sources that were changed since they were written.  A ValueError where the board cannot play the scene, or a file of
     `folder` would be overwritten that is not as it was written.
     """
-    if rendering.scene.device == SCREEN:
+    if _law(rendering) == "screen":
         board: Any = copy(rendering.device)
         board.sensed_channels = 0
         rendering = prepare(rendering.scene, driver=board, compiled=False)
@@ -80,6 +79,13 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
     return [folder / name for name in sorted(texts)]
 
 
+def _law(rendering: Rendering) -> str:
+    """Return which law of the firmware plays a rendering, see `Rendering.board_law`."""
+    if rendering.board_law is None:
+        raise ValueError(f"{rendering.scene.device}: its renderer names no law of a board: must set `board_law`")
+    return rendering.board_law()
+
+
 def _memory(sizes: dict[str, int]) -> str:
     """State the static memory of a board of these sizes."""
     taken = OTHER_BYTES + (PAST_BYTES if sizes["DAMPER_TAPS"] > 16 else 0)
@@ -96,7 +102,7 @@ def sources() -> list[Path]:
 
 def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
     """Return sizes (in design.h) and fields of `design_t` for a rendering's controller; see `export` for the errors."""
-    screen, used = rendering.scene.device == SCREEN, rendering.bands
+    screen, used = _law(rendering) == "screen", rendering.bands
     if screen and rendering.design and rendering.scene.method == "inverse":  # whatever it plays is a waveform
         used = replace(Bands.none(spatial=False), differentiated=True)
         controller: Any = rendering.design(used)
@@ -176,10 +182,6 @@ def supervision_table(rendering: Rendering) -> dict[str, Any]:
 def _checked(rendering: Rendering, playing: Bands, controller: Any, bands: int) -> int:
     """Most bands of the board; refuses what its law does not play."""
     scene, model, used, root = rendering.scene, rendering.model, len(playing), rendering.shape
-    if scene.device not in ("vt-plate", SCREEN):
-        raise ValueError(f"device.kind = {scene.device!r}: a board plays vt-plate and {SCREEN} only")
-    if root and (root.straight or getattr(rendering.driver, "hold", 0)):
-        raise ValueError("render: a board plays the envelope of a carrier by its square root, without other settings")
     if not (root or rendering.driver.sensed_channels):
         raise ValueError("driver.sensed_channels = 0: must be 1 or more on a plate's board, which is supervised")
     if scene.method != "inverse":

@@ -20,7 +20,6 @@ from hapticrender.inferred import ContactLag
 from hapticrender.loop import (
     RECENT,
     device_fault,
-    differences,
     motion_of,
     motion_source,
     stops_itself,
@@ -267,9 +266,10 @@ class LiveLoop(RealtimeEntry):
         first, signals = self.signals(self.samples - round(JUDGED * self.driver.rate))
         return band_figures(self.rendering.bands, first, self.driver.rate, signals)
 
-    def compare(self) -> tuple[str, ...]:
-        """State where the device differs from the model of the controller that runs, unless that was stopped."""
-        return () if self.stopped is not None else differences(self.rendering, self.running)
+    @property
+    def learned(self) -> Controller | None:
+        """The controller that runs, and has learned of the device, unless that was stopped."""
+        return None if self.stopped is not None else self.running
 
     def fault(self) -> HapticError | None:
         """Return why the drive was stopped, once it has faded out and stayed at zero for as long again."""

@@ -64,7 +64,8 @@ def prepare(
     refuse_to_overwrite(scene.texture, getattr(driver, "path", None))
     kind = getattr(driver, "device_kind", scene.device)
     if kind != scene.device:
-        raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it, and plays nothing else")
+        cure = "export this scene to it, or take another driver"
+        raise ValueError(f"device = {scene.device!r}: {driver} has the law of {kind!r} on it: {cure}")
     renderer = registered("renderers", scene.device)() if renderer is None else renderer
     if inspect.isclass(renderer) or not callable(getattr(renderer, "open", None)):
         kind = f"class {renderer.__name__}" if inspect.isclass(renderer) else type(renderer).__name__
@@ -157,9 +158,10 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         if fault:
             fault.recording = recorder.finish()
             raise fault
+        compared = differences(rendering, getattr(device, "learned", loop.controller))
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
-    recording.warnings = differences(rendering, loop.controller)
+    recording.warnings = compared
     warn_of(recording.warnings, recording)
     return recording
 
@@ -385,8 +387,8 @@ class _Loop:
         return {"motion": motion, "motion_source": motion_source(driver, model, "motion" in signals)}
 
 
-def differences(rendering: Rendering, controller: Controller) -> tuple[str, ...]:
-    """State where a device differs from its model, by what a controller has learned on it."""
+def differences(rendering: Rendering, controller: object) -> tuple[str, ...]:
+    """State where a device differs from its model, by what a controller, or its telemetry, has learned on it."""
     scale, mismatch = getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
     source, messages = rendering.scene.source, []
     if scale < 1.0:

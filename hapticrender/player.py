@@ -20,7 +20,6 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -29,12 +28,13 @@ import numpy as np
 
 from hapticrender.checks import flag, number, require
 from hapticrender.control.carriers import FASTEST
-from hapticrender.devices import open_driver, registered
+from hapticrender.devices import open_driver
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion, is_called_back
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import FADE_OUT, opened, play_zeros, prepare, recorder_of, warn_of
+from hapticrender.loop import FADE_OUT, differences, opened, play_zeros, prepare, recorder_of, warn_of
+from hapticrender.player_scene import scenes_of
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Driver, Flag, Rendering, Texture
@@ -42,14 +42,11 @@ from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.sampled_texture import REACH
 from hapticrender.touch.composed import Playlist
 from hapticrender.touch.finger import MOST_LOAD, Finger
-from hapticrender.touch.grating import Grating
 from hapticrender.touch.scene import Scene
 
 MOST_GAIN = 10.0
 LONGEST_WATCHDOG = 60.0  # s
-ANY = Grating(frequency=100.0, amplitude=1e-6)
-NOMINAL = Finger.sliding(speed=0.08, normal_load=0.4)  # for which a device is designed where none is stated
-LONGEST, SHORTEST = 3600.0, 1e-3  # s: duration of a scene that has no end, as it is designed, as a recording says
+SHORTEST = 1e-3  # s: duration of a scene that has no end, as a recording says
 SERVICE = 0.05  # s between two looks: what comes next is computed, what was is recorded, faults are seen
 LEAST_PART = 0.1  # s, of a playlist along the surface: twice the time between two looks at what is due
 UPDATES = 0.2  # s: two positions within this time show a velocity
@@ -105,18 +102,8 @@ class Player(Addressed):
     ) -> None:
         if watchdog not in (None, math.inf):
             watchdog = number("watchdog", watchdog, "s", least=2.0 * SERVICE, most=LONGEST_WATCHDOG)
-        if "texture" in tables:
-            raise TypeError("texture: a player has none of its own: call play(texture)")
-        if tables.get("touch_panel"):
-            cure = "pass positions to `finger` that hr.TouchPanel(...).estimator() has estimated"
-            raise ValueError(f"touch_panel: has no effect on the positions that the application sets: {cure}")
-        if isinstance(device, Scene):
-            self._given: Scene | None = replace(device, finger=finger or device.finger, **tables)
-            self._scene = partial(replace, self._given)
-        else:
-            fields = {"finger": finger or NOMINAL, "duration": LONGEST, **tables}
-            self._given, self._scene = None, partial(Scene, device=device, **fields)
-        registered("renderers", self._scene(texture=ANY).device)  # what is not there is refused at once
+        self._scene = scenes_of(device, finger, tables)  # what is not there is refused at once
+        self._given = isinstance(device, Scene)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
@@ -155,7 +142,7 @@ class Player(Addressed):
             last.callback(self._stopping.set)
             last.callback(self._rest, kind is None)
             if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; while it plays
-                compared = getattr(self._loop, "compare", tuple)()
+                compared = self._compare()
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
@@ -274,8 +261,12 @@ class Player(Addressed):
             if unwritten is not None:
                 raise unwritten
             recording = recorder.finish()
-            recording.warnings = getattr(self._loop, "compare", tuple)()
+            recording.warnings = self._compare()
             return recording
+
+    def _compare(self) -> tuple[str, ...]:
+        loop = self._loop
+        return () if loop is None else differences(loop.rendering, getattr(loop, "learned", None))
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""
@@ -371,7 +362,7 @@ class Player(Addressed):
             raise ValueError("paced = False: must be True on a device with a clock of its own")
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
-        if self._given is None and rendering.plant is not None:
+        if not self._given and rendering.plant is not None:
             self._motion.attach(rendering)
         stack.enter_context(opened(rendering.driver, device, self._threads.hanging.is_set))
         if rendering.probe is not None:
@@ -410,7 +401,7 @@ class Player(Addressed):
 
     def _block(self, late: bool = False) -> None:
         """Play a block; `late`: the device lost samples before it."""
-        self._loop.advance(self._given is not None or self._finger is None, late)
+        self._loop.advance(self._given or self._finger is None, late)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
@@ -445,8 +436,8 @@ class Player(Addressed):
 
     def _point(self) -> None:
         """Send the position of the scene's finger to a device that does not sense it."""
-        if self._given is not None and self._finger is None and not self._loop.senses:
-            finger, now = self._given.finger, self.time + np.array([0.0, INSTANT])
+        if self._given and self._finger is None and not self._loop.senses:
+            finger, now = self._loop.rendering.scene.finger, self.time + np.array([0.0, INSTANT])
             (here, there), load = finger.position(now), finger.load(now)[0]
             self._loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)
 

@@ -177,6 +177,7 @@ class Rendering:
     design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only
     shape: Any = None  # static characteristic before the device, for this texture: `shape` of `plant`, else of `driver`
     probe: Callable[[Driver], None] | None = None  # checks the open device before the loop closes; None: nothing does
+    board_law: Callable[[], str] | None = None  # "plate" or "screen", which boards have; else a ValueError; None: none
 
     @property
     def samples(self) -> int:
@@ -218,7 +219,8 @@ class Renderer(Protocol):
     def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
         """Open a scene on the device behind `driver`, or on the simulated one; read its tables once, check everything.
 
-        A ValueError or TypeError where the scene requests what the device cannot do.
+        A ValueError or TypeError where the scene requests what the device cannot do.  What of that no texture could
+        change, ``check(scene)`` may refuse (optional), which `hapticrender.Player` calls where it is made.
         """
         ...
 

@@ -321,9 +321,14 @@ def export(arguments: argparse.Namespace) -> int:
     outputs.check_folder("--out", arguments.out)
     scene = validation.open_scene(arguments.scene)
     with naming(arguments.scene):
-        written = export_design(prepare(scene), arguments.out, bands=arguments.bands, force=arguments.force)
+        rendering = prepare(scene)
+        written = export_design(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
     folder = shlex.quote(str(arguments.out))
     print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {folder}")
+    if rendering.shape is not None and rendering.driver.sensed_channels:
+        print(
+            "in open loop, as a board reads no tribometer; in closed loop play it from the host (--driver audio:NAME)"
+        )
     return 0
 
 

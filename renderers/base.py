@@ -76,7 +76,13 @@ class BaseRenderer:
             design=design,
             shape=self.shape(setup),
             probe=self.probe(setup, model, device),
+            board_law=partial(self.board_law, setup),
         )
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a method or an entry of the tables with which no texture could be played; `open` refuses the rest."""
+        method_named(scene.method)
+        self.read(scene, None)
 
     def read(self, scene: Scene, driver: Driver | None) -> Setup:
         """Return the setup: what the scene's tables say, in the form that the other parts take."""
@@ -127,6 +133,10 @@ class BaseRenderer:
     def probe(self, setup: Setup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes the open device before the loop closes; None where nothing does."""
         return None
+
+    def board_law(self, setup: Setup) -> str:
+        """Return the law of ``drivers/firmware`` that plays the scene, "plate" or "screen"; a ValueError: none does."""
+        raise ValueError(f"device.kind = {self.name!r}: no board has a law for it: play it from the host (--driver)")
 
     def waveform(self, setup: Setup, texture: Texture) -> Waveform:
         """Return the target waveform of `texture` over time (s) and position (m), in the device's quantity."""

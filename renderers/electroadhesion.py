@@ -9,7 +9,7 @@ from voltage and current, or nothing.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hapticrender.checks import inside, option, parameter
+from hapticrender.checks import inside, option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
@@ -101,11 +101,19 @@ class ElectroadhesionRenderer(FrictionRenderer):
         One with the law of a screen on it has the square root, too.
         """
         if getattr(driver, "device_kind", "") == self.name:
+            self.board_law(setup)
             return driver
         if setup.settings.output == "envelope":
             return ShapedDriver(driver, setup.compensation)
         carrier, rate = setup.assumed.carrier_frequency, setup.assumed.rate
         return CarrierDriver(driver, setup.compensation, frequency=carrier, envelope_rate=rate)
+
+    def board_law(self, setup: ScreenSetup) -> str:
+        """Return the law of boards that plays it, in open loop; its hardware makes the carrier."""
+        for name, only in (("square_root", "on"), ("output", "envelope")):
+            value = getattr(setup.settings, name)
+            require(value == only, f"render.{name}", value, f"{only!r} on a board, which puts out the carrier's peak")
+        return "screen"
 
     def shape(self, setup: ScreenSetup) -> SquareRoot:
         """Return the square root for the scene."""

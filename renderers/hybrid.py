@@ -159,6 +159,14 @@ class HybridRenderer(BaseRenderer):
         part = _part_of(driver, COILS, SENSORS, "plate")
         return self._plate.probe(setup.plate, model, part) if getattr(driver, "probe", True) else None
 
+    def board_law(self, setup: HybridSetup) -> str:
+        """Refuse boards."""
+        why = "no board plays it: it takes two laws, of coils and screen, and a board has one"
+        cure = (
+            "play it from the host (--driver 'audio:NAME?channels=1,2,3'), or its plate alone, with kind = 'vt-plate'"
+        )
+        raise ValueError(f"device.kind = {self.name!r}: {why}: {cure}")
+
     def shape(self, setup: HybridSetup) -> Any:
         """Return the square root for the screen's share of the scene."""
         return None if setup.friction is None else setup.friction.compensation

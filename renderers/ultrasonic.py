@@ -74,6 +74,12 @@ class UltrasonicRenderer(FrictionRenderer):
         allowed = setup.settings.probe and getattr(driver, "probe", True) and driver.sensed_channels
         return partial(probe_resonance, mode=setup.assumed.mode) if allowed else None
 
+    def board_law(self, setup: SurfaceSetup) -> str:
+        """Refuse boards."""
+        why = "no board plays it: its drive is computed at the carrier's rate, 192 kHz or more"
+        cure = "play it from the host, such as by --driver 'audio:NAME?rate=192000'"
+        raise ValueError(f"device.kind = {self.name!r}: {why}: {cure}")
+
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""
         assumed, load = setup.assumed, setup.load

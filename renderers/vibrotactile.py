@@ -60,6 +60,10 @@ class VibrotactileRenderer(BaseRenderer):
         whole = setup.assumed.coils == driver.sensed_channels == 2
         return partial(probe_plate, model=model) if setup.probe and getattr(driver, "probe", True) and whole else None
 
+    def board_law(self, setup: PlateSetup) -> str:
+        """Return the law of boards that plays it."""
+        return "plate"
+
     def device_model(self, setup: PlateSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the plate behind `driver`."""
         assumed, coils = setup.assumed, setup.assumed.coils

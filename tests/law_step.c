@@ -14,6 +14,7 @@ uint32_t law_gain(int64_t state, double gain);
 uint32_t law_bands(int64_t state, const double rows[], uint32_t count);
 void law_envelope(int64_t state, uint32_t band, double envelopes[4]);
 void law_covariance(int64_t state, double covariance[LAW_PARAMETERS * LAW_PARAMETERS]);
+double law_differs(int64_t state);
 int64_t law_rows(int64_t state, int64_t signals, int64_t start, int64_t count);
 size_t supervised_size(void);
 void supervised_start(int64_t state);
@@ -54,6 +55,8 @@ void law_envelope(int64_t state, uint32_t band, double envelopes[4])
     envelopes[2] = (double)measured[0];
     envelopes[3] = (double)measured[1];
 }
+
+double law_differs(int64_t state) { return (double)law_mismatch(at(state)); }
 
 void law_covariance(int64_t state, double covariance[LAW_PARAMETERS * LAW_PARAMETERS])
 {

@@ -119,6 +119,7 @@ class Exports:
         library = ctypes.CDLL(str(compile_c(folder / f"law-{kind}.so", files, *options, "-shared")))
         address, number, count = ctypes.c_int64, ctypes.c_double, ctypes.c_uint32
         library.law_size.restype = library.supervised_size.restype = ctypes.c_size_t
+        library.law_differs.restype = number
         for name, types in {
             "law_start": (address,),
             "law_limit": (address, number),
@@ -126,6 +127,7 @@ class Exports:
             "law_bands": (address, address, count),
             "law_envelope": (address, count, address),
             "law_covariance": (address, address),
+            "law_differs": (address,),
             "law_rows": (address,) * 4,
             "supervised_start": (address,),
             "supervised_cause": (address,),

@@ -335,7 +335,7 @@ def test_a_table_is_as_fine_as_it_has_to_be(stepped):
 
 def test_a_force_and_carriers_are_refused(stepped):
     screen = replace(SCENE, texture=hr.Grating(velocity=8e-3, frequency=80.0), device="electroadhesion")
-    with pytest.raises(ValueError, match=r"device = 'electroadhesion': .*has the law of 'vt-plate' on it, and plays"):
+    with pytest.raises(ValueError, match=r"device = 'electroadhesion': .*has the law of 'vt-plate' on it: export"):
         hr.render(screen, driver=stepped.driver())
     scene = replace(SCENE, texture=hr.Recorded(**RECORDED, carriers=4), duration=0.1)
     with pytest.raises(ValueError, match="carriers = 4: must be left out on a board"):

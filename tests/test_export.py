@@ -4,6 +4,7 @@ import fnmatch
 import re
 import subprocess
 import tomllib
+from dataclasses import replace
 from graphlib import TopologicalSorter
 
 import pytest
@@ -12,6 +13,7 @@ from board import FIRMWARE, ROOT, SCENE, build_board
 import hapticrender as hr
 from hapticrender import cli
 from hapticrender.export import board_design, export, sources
+from hapticrender.renderers.vibrotactile import VibrotactileRenderer
 
 
 def test_export_says_what_it_writes_and_keeps_what_was_changed(exports, tmp_path):
@@ -32,6 +34,31 @@ def test_export_says_what_it_writes_and_keeps_what_was_changed(exports, tmp_path
 def test_the_command_line_exports(tmp_path, capsys):
     assert cli.main(["export", "grating-47", "--out", str(tmp_path / "bo ard")]) == 0
     assert f"build them with: make -C '{tmp_path / 'bo ard'}'\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("scene", "noted"), [("screen-spatial", True), ("grating-47", False)])
+def test_a_screen_with_a_tribometer_is_exported_in_open_loop_and_the_command_says_so(tmp_path, capsys, scene, noted):
+    assert cli.main(["export", scene, "--out", str(tmp_path / "board")]) == 0
+    said = capsys.readouterr().out
+    assert ("in open loop, as a board reads no tribometer; in closed loop play it from the host" in said) == noted
+
+
+class Pad(VibrotactileRenderer):
+    """A plate of another kind."""
+
+    name = "pad"
+
+
+def test_what_a_board_plays_is_asked_of_the_renderer(tmp_path):
+    """Not of its name; a rendering of no renderer of the library says what it lacks."""
+    pad = hr.prepare(replace(SCENE, device="pad"), renderer=Pad())
+    folders = tmp_path / "pad", tmp_path / "plate"
+    for rendering, folder in zip((pad, hr.prepare(SCENE)), folders, strict=True):
+        export(rendering, folder)
+    for name in "design.h", "design.c":
+        assert len({(folder / name).read_text() for folder in folders}) == 1
+    with pytest.raises(ValueError, match="pad: its renderer names no law of a board: must set `board_law`"):
+        export(replace(pad, board_law=None), tmp_path)
 
 
 def test_every_source_is_shipped():

@@ -13,6 +13,7 @@ from waves import waveform_error
 
 import hapticrender as hr
 from hapticrender.control import supervisor_kernel as causes
+from hapticrender.loop import MISMATCH
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.protocols import Flag
 
@@ -43,6 +44,29 @@ def test_double_equals_the_kernel(exports, name, finger, limit):
     assert abs(drive).max() > 0.01, "nothing was played"
     assert np.isfinite(position).any()
     assert (limit is not None) == bool((flags & Flag.SATURATED).any())
+
+
+@pytest.mark.parametrize(
+    ("finger", "stiffer", "limit", "found"),
+    [
+        (hr.Finger.absent(), 1.0, 0.3, (1e-4, MISMATCH)),
+        (hr.Finger.absent(), 1.05, 0.3, (MISMATCH, 1.0)),
+        (hr.Finger.absent(), 1.05, 0.01, (0.0, 0.0)),
+        (FINGERS["touch"], 1.05, 0.3, (0.0, 0.0)),
+    ],
+    ids=["right", "wrong", "saturated", "touched 0.8 s ago"],
+)
+def test_both_find_the_same_difference_of_a_device_from_its_model(exports, finger, stiffer, limit, found):
+    """Springs that are right, or 5 % stiffer; 0, unknown, at the drive's limit, or after a finger."""
+    nominal = PlateParameters(current_bits=0)
+    springs = {name: stiffer * getattr(nominal, name) for name in ("stiffness_1", "stiffness_2")}
+    plate, kernel = Plate(replace(nominal, **springs), finger, seed=1), kernel_of(exports, "tones", limit)
+    signals = plate.closed_loop(kernel, np.zeros(SAMPLES))[3]
+    law = exports.law("tones", "double")
+    assert law.code.law_limit(law.address, limit)
+    law.run(*(np.ascontiguousarray(each) for each in (signals.sensed, signals.position)), np.zeros(SAMPLES))
+    assert law.code.law_differs(law.address) == pytest.approx(kernel.mismatch, rel=1e-9)
+    assert found[0] <= kernel.mismatch <= found[1]
 
 
 @pytest.mark.parametrize("device", DEVICES)

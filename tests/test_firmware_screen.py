@@ -107,6 +107,9 @@ def test_a_board_plays_a_screen(program, tmp_path, library):
         assert (driver.device_kind, driver.drive_channels, driver.sensed_channels) == ("electroadhesion", 1, 0)
     root = library[0].shape
     drive, position = recording.drive[:, 0], recording.read("position")
+    position[: np.argmax(np.isfinite(position))] = position[np.isfinite(position)][
+        0
+    ]  # it is sent once the run has begun
     assert not recording.read("flags").any()
     assert recording.header.motion_source == "unknown"
     # from rest to the bias without a step of more than the fade of 10 ms makes
@@ -193,8 +196,22 @@ def test_a_screen_plays_live(program, tmp_path):
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"device": "ultrasonic", "profile": {}}, "device.kind = 'ultrasonic': a board plays vt-plate and electroadh"),
-        ({"rendering": {"square_root": "off"}}, "render: a board plays the envelope of a carrier by its square root"),
+        (
+            {"device": "ultrasonic", "profile": {}},
+            "'ultrasonic': no board plays it: its drive is .*rate, 192 kHz .*: play it",
+        ),
+        (
+            {"device": "hybrid", "profile": {}},
+            "'hybrid': no board plays it: it takes two laws, .*: play .*, or its plate alone",
+        ),
+        (
+            {"rendering": {"square_root": "off"}},
+            "square_root = 'off': must be 'on' on a board, which puts out the carrier's",
+        ),
+        (
+            {"rendering": {"output": "carrier"}},
+            "output = 'carrier': must be 'envelope' on a board, which puts out the carri",
+        ),
         ({"method": "h2"}, "method = 'h2': a board plays \"inverse\" only"),
     ],
 )
@@ -203,10 +220,26 @@ def test_what_no_board_plays_is_refused(tmp_path, change, problem):
         export(hr.prepare(replace(SCREEN, **change)), tmp_path)
 
 
-def test_a_plate_is_refused_by_a_screens_board(program, tmp_path):
-    refused = pytest.raises(ValueError, match="device = 'vt-plate': .*has the law of 'electroadhesion' on it")
+@pytest.mark.parametrize(
+    ("scene", "problem"),
+    [
+        (
+            SCENE,
+            "device = 'vt-plate': .*has the law of 'electroadhesion' on it: export this scene to it, or take another",
+        ),
+        (replace(SCREEN, device="hybrid", profile={}), "device = 'hybrid': .*has the law of 'electroadhesion' on it: "),
+        (
+            replace(SCREEN, device="ultrasonic", profile={}),
+            "device = 'ultrasonic': .*has the law of 'electroadhesion' on",
+        ),
+        (replace(SCREEN, rendering={"square_root": "off"}), "square_root = 'off': must be 'on' on a board"),
+    ],
+    ids=["plate", "hybrid", "ultrasonic", "square root off"],
+)
+def test_other_devices_are_refused_by_a_screens_board(program, tmp_path, scene, problem):
+    refused = pytest.raises(ValueError, match=problem)
     with SteppedBoard(tmp_path, program=program) as board, refused:
-        hr.render(SCENE, driver=board.driver())
+        hr.render(scene, driver=board.driver())
 
 
 @pytest.mark.parametrize("kind", KINDS)

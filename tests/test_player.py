@@ -1,5 +1,6 @@
 """Live play, not paced: what plays is the texture, whatever changes on the way, and whoever drives the device."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -318,3 +319,22 @@ def test_a_driver_that_another_player_has_open_is_refused():
 def test_a_device_that_cannot_be_is_refused_at_once(device, error, message):
     with pytest.raises(error, match=message):
         hr.Player(device)
+
+
+@pytest.mark.parametrize("device", ["vt-plate", "electroadhesion", "ultrasonic", "hybrid"])
+@pytest.mark.parametrize(
+    ("tables", "error", "message"),
+    [
+        ({}, None, ""),
+        ({"method": "tea"}, ValueError, "method = 'tea': must be one of paper"),
+        ({"profile": {"massive": 1.0}}, ValueError, "device.massive = 1.0: unknown key; known: "),
+        ({"simulation": {"massive": 1.0}}, ValueError, "simulation.massive = 1.0: unknown key; known: "),
+        ({"profile": {"rate": -1.0}}, ValueError, "device.rate = -1.0: must be a finite number >= "),
+        ({"rendering": {"probe": 1}}, TypeError, "render.probe = 1: must be true or false"),
+    ],
+)
+def test_a_method_and_entries_that_no_texture_could_be_played_with_are_refused_at_once(device, tables, error, message):
+    """By a scene's tables, too; with none of them wrong it is made."""
+    for made_of in (lambda: device, lambda: hr.Scene(texture=TONE, duration=1.0, device=device)):
+        with pytest.raises(error, match=message) if error else nullcontext():
+            hr.Player(made_of(), **tables)

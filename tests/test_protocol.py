@@ -78,6 +78,7 @@ def test_the_table_has_what_a_board_sends():
     telemetry, stream = protocol.telemetry(frames[Kind.TELEMETRY]), protocol.stream(frames[Kind.STREAM], 2, 2)
     assert (telemetry.sample, telemetry.session, telemetry.state) == (5051, SESSION, protocol.State.PLAYING)
     assert (telemetry.flags, telemetry.position) == (Flag.SENSOR_CLIPPED, pytest.approx(10e-3))
+    assert (telemetry.mismatch, telemetry.damper_scale) == (0.0625, 1.0)
     assert [each.target for each in telemetry.bands] == pytest.approx([10e-6])
     assert (stream.first, stream.stride, len(stream.rows)) == (5051, 10, 2)
 

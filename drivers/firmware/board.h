@@ -18,7 +18,7 @@
 #include "texture.h"
 
 enum {
-    BOARD_VERSION = 5,
+    BOARD_VERSION = 6,
     BOARD_SILENCE_MS = 80,                        /* without a keep-alive (HEARTBEAT, FINGER): fade out */
     BOARD_FADE_MS = 10,
     BOARD_EXTRAPOLATE_MS = 50,                    /* a finger's position follows its velocity for so long, then holds */
@@ -70,13 +70,13 @@ typedef struct {
 } finger_input_t;
 
 typedef struct {
+    uint64_t clock;                               /* us since reset, times 65536; first: the only one of 8 bytes */
     law_t law;
     supervisor_t supervisor;
     design_t played;                              /* the design, with the bands in use */
     board_state state;
     uint32_t cause;                               /* a board_cause, or CAUSE_SUPERVISOR and the supervisor's */
     uint32_t sample;                              /* since reset; wraps */
-    uint64_t clock;                               /* us since reset, times 65536 */
     uint32_t clock_step;
     uint32_t nonce, session;                      /* the host's number, and what the board made of it; 0: no host */
     uint16_t commanded, kept_alive, next;         /* sequence of the last command, the last keep-alive, the next out */

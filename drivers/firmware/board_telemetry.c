@@ -2,7 +2,7 @@
 #include "board.h"
 #include "hardware.h"
 
-enum { TELEMETRY_BANDS = 12, ROW = 4 * (LAW_CHANNELS + LAW_SENSORS + 3) + 2, STREAM_HEAD = 6 };
+enum { TELEMETRY_BANDS = 11, ROW = 4 * (LAW_CHANNELS + LAW_SENSORS + 3) + 2, STREAM_HEAD = 6 };
 
 void board_send(board_t *board, uint8_t kind, uint16_t sequence, const uint8_t *payload, size_t count)
 {
@@ -53,6 +53,7 @@ static void telemetry_from(board_t *board, uint32_t first, uint32_t bands)
     at = put_u32(put_u32(at, mean), board->cycles_most);
     at = put_u32(put_u32(put_u32(at, board->bad), board->refused), board->dropped);
     at = put_u32(put_f32(at, (float)board->position), board->commits);
+    at = put_f32(put_f32(at, (float)law_mismatch(&board->law)), (float)board->law.damper_scale);
     at = put_u8(put_u8(at, (uint8_t)first), (uint8_t)bands);
     for (uint32_t band = first; band < bands && band < first + TELEMETRY_BANDS; band++) {
         at = put_band(board, at, band);

@@ -11,6 +11,7 @@
 #define HUGE_NUMBER REAL(1e6)     /* A or N: no drive, no force */
 #define SLOWEST REAL(0.1)         /* of the typical speed: a slower contact hardly modulates at all */
 #define SCALED REAL(0.999)        /* a reference scaled by less is saturated */
+#define LEAST_TARGET REAL(3e-3)   /* of the sensors' range: below it noise adds more than a wrong device model */
 
 void law_init(law_t *law, const design_t *used)
 {
@@ -235,6 +236,16 @@ static void nominal_force(law_t *law, real_t force[2])
     force[1] = d->pattern[0] * of[0][1] + d->pattern[1] * of[1][1];
 }
 
+/* Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it. */
+static void update_powers(law_t *law, real_t nominal, real_t learned)
+{
+    const real_t pole = REAL(1.0) / law->design->rate;
+    const real_t free = (law->learning.contact == 0u) ? REAL(1.0) : REAL(0.0);
+    law->reference_power += pole * (free * law->reference * law->reference - law->reference_power);
+    law->nominal_power += pole * (free * nominal * nominal - law->nominal_power);
+    law->learned_power += pole * (free * learned * learned - law->learned_power);
+}
+
 /* Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro. */
 static real_t levelling_force(law_t *law)
 {
@@ -252,6 +263,8 @@ static void recover(law_t *law)
     law->moment = REAL(0.0);
     law->slow = REAL(0.0);
     law->power = REAL(0.0);
+    law->nominal_power = REAL(0.0);
+    law->learned_power = REAL(0.0);
     law->peak = REAL(0.0);
     law->scale = REAL(1.0);
     law->smooth_scale = REAL(1.0);
@@ -373,6 +386,7 @@ uint32_t law_step(
     }
     nominal_force(law, nominal);
     learning_force(law, learned);
+    update_powers(law, nominal[0], learned[0]);
     force[0] += nominal[0] + learned[0];
     force[1] += nominal[1] + learned[1] + levelling_force(law);
     play(law, force, nominal, drive);
@@ -384,6 +398,17 @@ uint32_t law_step(
 real_t law_carrier(const design_t *used, real_t drive)
 {
     return (LAW_FRICTION != 0u) ? real_sqrt(real_max(used->bias + drive, used->least) / used->attraction) : drive;
+}
+
+real_t law_mismatch(const law_t *law)
+{
+    const design_t *d = law->design;
+    const real_t least = LEAST_TARGET * d->sensor_limit;
+    const uint32_t settled = (real_min((real_t)law->sample, (real_t)law->learning.since) >= d->rate) ? 1u : 0u;
+    const uint32_t free = ((law->learning.contact == 0u) && (d->learns != 0u)) ? 1u : 0u;
+    const uint32_t moves = ((law->nominal_power > REAL(0.0)) && (REAL(2.0) * law->reference_power > least * least)) ? 1u : 0u;
+    const uint32_t known = ((settled + free + moves == 3u) && (law->smooth_scale > SCALED)) ? 1u : 0u;
+    return (known != 0u) ? real_sqrt(law->learned_power / law->nominal_power) : REAL(0.0);
 }
 
 real_t law_reference(const law_t *law) { return law->reference / law->smooth_scale; }

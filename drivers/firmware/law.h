@@ -146,6 +146,7 @@ typedef struct law {
     real_t peak, scale, smooth_scale;
     real_t shaper[2][LAW_CHANNELS];
     real_t measured_dc;
+    real_t nominal_power, learned_power, reference_power; /* N^2, N^2, m^2: of law_mismatch */
     uint32_t hold_left, fast_timer;           /* samples */
     uint32_t at_delayed, at_ring;             /* places in `delayed` and `ring` */
     uint32_t sample;                          /* modulo 2^32 */
@@ -184,6 +185,9 @@ void law_measured(const law_t *law, uint32_t band, real_t envelope[2]);
  * Peak of the carrier (A or V, as exported) for a drive (N) of a friction device; the drive itself on a plate.
  */
 real_t law_carrier(const design_t *used, real_t drive);
+
+/* Force that was learned on the untouched device over that of its model, rms over about a second; 0: not known. */
+real_t law_mismatch(const law_t *law);
 
 /* Reference (m) of the last sample's sensing, before it is scaled down to the drive's limit. */
 real_t law_reference(const law_t *law);
