@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import number, require
+from hapticrender.checks import number, require, scales
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
@@ -78,10 +78,10 @@ class RealtimeEntry(Addressed):
     ----------
     controller : Controller
         With a compiled step; its state goes on here, so do not run it elsewhere meanwhile.
-    sensed_scale : float, m of full scale, > 0
-        Unit of a float sample of 1.0 at the input.
-    drive_scale : float, 1/A of full scale, > 0
-        Float sample at the output for a drive of 1 A.
+    sensed_scale : float or array of float, m of full scale, > 0
+        Unit of a float sample of 1.0 at the input, of all sensors or of each.
+    drive_scale : float or array of float, 1/A of full scale, > 0
+        Float sample at the output for a drive of 1 A, of all channels or of each.
     frames : int, samples, optional
         Of a call, a multiple of the controller's block, which it is unless given; `log` needs it.
 
@@ -104,12 +104,15 @@ class RealtimeEntry(Addressed):
     """
 
     def __init__(
-        self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0, frames: int | None = None
+        self,
+        controller: Any,
+        *,
+        sensed_scale: float | Array = 1.0,
+        drive_scale: float | Array = 1.0,
+        frames: int | None = None,
     ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
-        number("sensed_scale", sensed_scale, "m", above=0.0)
-        number("drive_scale", drive_scale, "1/A", above=0.0)
         self.controller = controller
         self.block, self.rate = controller.block, float(controller.rate)
         self.frames = self.block if frames is None else frames
@@ -124,11 +127,16 @@ class RealtimeEntry(Addressed):
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
+        for name, given, count in (
+            ("sensed_scale", sensed_scale, controller.sensors),
+            ("drive_scale", drive_scale, controller.channels),
+        ):
+            self._arrays[name] = np.resize(scales(name, given, count), count)
         self._signals = {name: self._arrays[name] for name in BLOCK}
         self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
         fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
         fields |= {"control": self._control.address, "tracker": self._tracker}
-        self._entry = record_of(ENTRY, **fields, sensed_scale=sensed_scale, drive_scale=drive_scale)
+        self._entry = record_of(ENTRY, **fields)
         self.user_data = int(self._entry.ctypes.data)
         self._arrays["copies"][:] = np.concatenate([self._entry.view(np.int64), self._slot.view(np.int64)])
 

@@ -40,12 +40,12 @@ CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
     "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
-    "tracker"
+    "tracker sensed_scale_at drive_scale_at"
 )
 _COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken rooted"
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
 _STATE = "gain touch place pace offset offset_input lead lead_input open bias level"
-_SETTINGS = "rate sensed_scale drive_scale fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
+_SETTINGS = "rate fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
         *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
@@ -339,8 +339,11 @@ def advance(entry):
 
 
 @kernel
-def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
-    """Advance by blocks of samples of `dtype` at two addresses; returns the flags, or -1 and zeros where it refuses."""
+def carry(entry, sensed, drive, frames, dtype, scaled):
+    """Advance by blocks of samples of `dtype` at two addresses, full scales where `scaled`, else in SI units.
+
+    Returns the flags, or -1 and zeros where it refuses.
+    """
     e, count = record(entry, ENTRY_T, 0), int(frames)
     out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
     if count % e.block or (sensed == 0 and e.sensors > 0) or drive == 0:
@@ -350,20 +353,22 @@ def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
     given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
     inputs, outputs = e.block * e.sensors, e.block * e.channels
     own, result = carray(pointer(e.sensed_at, F8), inputs), carray(pointer(e.drive_at, F8), outputs)
+    units = carray(pointer(e.sensed_scale_at, F8), e.sensors)
+    scales = carray(pointer(e.drive_scale_at, F8), e.channels)
     for block in range(count // e.block):
         for i in range(inputs):
-            own[i] = sensed_scale * given[block * inputs + i]
+            own[i] = given[block * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
         if e.rooted > 0 and e.channels == 1:
             own[:] = np.abs(own)  # friction, of a tribometer that keeps the sign of the lateral force
         raised |= advance(entry)
         for i in range(outputs):
-            out[block * outputs + i] = drive_scale * result[i]
+            out[block * outputs + i] = result[i] * (scales[i % e.channels] if scaled else 1.0)
     return raised
 
 
 def _plain(sensed, drive, frames, entry):
     """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
-    return carry(entry, sensed, drive, frames, F8, 1.0, 1.0)
+    return carry(entry, sensed, drive, frames, F8, False)
 
 
 def _audio(sensed, drive, frames, time, status, entry):
@@ -371,7 +376,7 @@ def _audio(sensed, drive, frames, time, status, entry):
     e = record(entry, ENTRY_T, 0)
     if status & LOST:
         e.lost = OVERRUN
-    return ABORT if carry(entry, sensed, drive, frames, F4, e.sensed_scale, e.drive_scale) < 0 else CONTINUE
+    return ABORT if carry(entry, sensed, drive, frames, F4, True) < 0 else CONTINUE
 
 
 PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))

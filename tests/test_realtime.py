@@ -258,13 +258,15 @@ def test_textures_that_have_faded_out_are_let_go():
     assert abs(entry.log(9900)["reference"]).max() == pytest.approx(20e-6, rel=0.02)
 
 
-def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(rng):
-    """Floats of 2e-4 m at full scale in, 1.0 for 4 A out."""
-    entry, twin = RealtimeEntry(controller(), sensed_scale=2e-4, drive_scale=0.25), controller()
+@pytest.mark.parametrize("scales", [(2e-4, 0.25), ([2e-4, 3e-4], [0.25, 2.0])])
+def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(scales, rng):
+    """Floats of 2e-4 m at full scale in, 1.0 for 4 A out; or of other units in every channel."""
+    units, drive_scale = np.array(scales[0]), np.array(scales[1])
+    entry, twin = RealtimeEntry(controller(), sensed_scale=scales[0], drive_scale=scales[1]), controller()
     floats = rng.standard_normal((400, 2)).astype(np.float32) * np.float32(0.01)
     given = np.full((400, 2), np.nan, np.float32)
     assert AUDIO(entry.address)(floats.ctypes.data, given.ctypes.data, 400, None, 0, entry.user_data) == 0
-    expected = 0.25 * twin.run(2e-4 * floats.astype(float), np.full(400, np.nan), np.zeros(400))[0]
+    expected = drive_scale * twin.run(units * floats.astype(float), np.full(400, np.nan), np.zeros(400))[0]
     np.testing.assert_array_equal(given, expected.astype(np.float32))
 
 
