@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 from synthetic import make_bands
 
 from hapticrender.control.methods import METHODS
@@ -84,6 +84,12 @@ def screen(speed: float, load: float) -> tuple[System, float]:
     b = np.array([[pole * parameters.friction_coefficient * attraction / FRICTION], [0], [0]])
     phi = expm(np.block([[a, b], [np.zeros((1, 4))]]) / RATE)
     return System(phi[:3, :3], phi[:3, 3:], np.array([[0.0, 1, 0]]), np.zeros((1, 1))), load / attraction
+
+
+def hybrid(speed: float, load: float) -> tuple[System, float]:
+    """A `screen` on the `plate`, whose finger presses in the middle."""
+    friction, offset = screen(speed, load)
+    return System(*map(block_diag, plate(0.0), friction)), offset
 
 
 def cable(delay: float = 0.0, taps: int = 33, gain: float = 1.0) -> System:
