@@ -10,7 +10,7 @@ from numba import carray, types
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
-from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
+from hapticrender.jit import CALLBACK, CONVERSION_T, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
 from hapticrender.sampled_texture import FRESH, TEXTURE_T, evaluate, runs_out, smoothstep, value_at
 
@@ -25,13 +25,11 @@ F4 = types.float32
 SLOT = np.dtype(
     [
         *((name, np.float64) for name in ("position", "velocity", "load", "gain", "watchdog")),
-        *((name, np.float64) for name in ("bias", "floor", "root_gain")),
-        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls", "straight")),
+        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls")),
     ]
 )
-"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), the square root of a
-screen (its floor over its bias), whether anything plays, the texture's record; how often it has set the finger, and
-called."""
+"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), whether anything plays,
+the texture's record; how often it has set the finger, and called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
 CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "shared", "limit_at")])
 """Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
@@ -40,11 +38,11 @@ CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
     "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
-    "tracker sensed_scale_at drive_scale_at"
+    "tracker sensed_scale_at drive_scale_at act sense converter conversion played_at given_at finger_at"
 )
-_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken rooted"
+_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken hold"
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
-_STATE = "gain touch place pace offset offset_input lead lead_input open bias level"
+_STATE = "gain touch place pace offset offset_input lead lead_input open level"
 _SETTINGS = "rate fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
@@ -280,19 +278,32 @@ def stop(entry):
 
 
 @kernel
-def take_root(entry, slot):
-    """Turn the drive of the last channel (N) into the peak of a carrier (A), by the square root around a bias.
-
-    The bias rises within `fade` and never falls; at rest the peak fades, as zero drive is the bias.
-    """
+def sense(entry, slot):
+    """Convert what the device gives to what the controller senses, where something is between them."""
     e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
-    drive = carray(pointer(e.drive_at, F8), (e.block, e.channels))[:, e.channels - 1]
-    rests = e.stopped >= 0 or s.playing == 0
-    for m in range(e.block):
-        e.bias = max(e.bias, min(e.bias + s.bias / e.fade, s.bias))
-        e.level = max(e.level - e.closing_step, 0.0) if rests else 1.0
-        attraction = max(e.bias + drive[m], s.floor * e.bias) / s.root_gain
-        drive[m] = e.level * (attraction / np.sqrt(2 * e.bias / s.root_gain) if s.straight > 0 else np.sqrt(attraction))
+    if e.sense != 0:
+        finger, position = carray(pointer(e.finger_at, F8), (e.block, 2)), carray(pointer(e.position_at, F8), e.block)
+        speed = s.velocity if e.age <= HORIZON * e.rate else 0.0
+        for m in range(e.block):
+            finger[m, 0], finger[m, 1] = s.load, speed if position[m] == position[m] else np.nan
+        call(e.sense, (e.converter, e.conversion, 0, e.block * e.hold))
+
+
+@kernel
+def act(entry, slot):
+    """Convert the drive to what is played, where something is between them; that fades at rest, as it has a bias."""
+    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
+    if e.act != 0:
+        call(e.act, (e.converter, e.conversion, 0, e.block))
+    if e.converter != 0:
+        played, rests = (
+            carray(pointer(e.played_at, F8), (e.block * e.hold, e.channels)),
+            e.stopped >= 0 or s.playing == 0,
+        )
+        for m in range(e.block * e.hold):
+            e.level = max(e.level - e.closing_step / e.hold, 0.0) if rests else 1.0
+            for i in range(e.channels):
+                played[m, i] *= e.level
 
 
 @kernel
@@ -316,22 +327,23 @@ def foresee(entry, slot, path):
 
 @kernel
 def advance(entry):
-    """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
+    """Advance the controller by the block that the device has given; returns all flags of the block."""
     e = record(entry, ENTRY_T, 0)
     flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
     slot = receive(entry)
     watch(entry, slot)
     play_texture(entry, slot)
     flags[:] = e.lost
+    record(e.conversion, CONVERSION_T, 0).lost = e.lost & OVERRUN
     e.lost = 0
+    sense(entry, slot)
     if record(slot, SLOT_T, 0).playing > 0 and not (e.timed_out > 0 and e.open == 0.0):
         run_controller(entry)
     else:
         drive[:] = 0.0
     raised = stop(entry)
     write_log(entry, slot)
-    if e.rooted > 0:
-        take_root(entry, slot)
+    act(entry, slot)
     e.flags |= raised
     swap(entry + SAMPLES_AT, e.samples + e.block)  # the log's rows are there for whoever reads the count
     keep(entry, slot)
@@ -346,20 +358,18 @@ def carry(entry, sensed, drive, frames, dtype, scaled):
     """
     e, count = record(entry, ENTRY_T, 0), int(frames)
     out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
-    if count % e.block or (sensed == 0 and e.sensors > 0) or drive == 0:
+    if count % (e.block * e.hold) or (sensed == 0 and e.sensors > 0) or drive == 0:
         e.refused += 1
         out[:] = 0.0
         return -1
     given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
-    inputs, outputs = e.block * e.sensors, e.block * e.channels
-    own, result = carray(pointer(e.sensed_at, F8), inputs), carray(pointer(e.drive_at, F8), outputs)
+    inputs, outputs = e.block * e.hold * e.sensors, e.block * e.hold * e.channels
+    own, result = carray(pointer(e.given_at, F8), inputs), carray(pointer(e.played_at, F8), outputs)
     units = carray(pointer(e.sensed_scale_at, F8), e.sensors)
     scales = carray(pointer(e.drive_scale_at, F8), e.channels)
-    for block in range(count // e.block):
+    for block in range(count // (e.block * e.hold)):
         for i in range(inputs):
             own[i] = given[block * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
-        if e.rooted > 0 and e.channels == 1:
-            own[:] = np.abs(own)  # friction, of a tribometer that keeps the sign of the lateral force
         raised |= advance(entry)
         for i in range(outputs):
             out[block * outputs + i] = result[i] * (scales[i % e.channels] if scaled else 1.0)

@@ -26,6 +26,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
 from hapticrender.realtime_kernel import ENTRY, HOLD, HORIZON, JUMP, MIDDLE_AT, swap
+from hapticrender.renderers.shaped import Port, ShapedDriver
 from hapticrender.sampled_texture import AHEAD, FADE, FRESH, SampledTexture, publish
 
 RATE, BLOCK = 5000.0, 10
@@ -117,19 +118,19 @@ def test_the_drive_of_a_screen_is_the_peak_of_its_carrier(straight, rng):
     """By the square root that is before a driver; a larger bias is reached within `FADE`; at rest it fades to zero."""
     wanted = bands(wavenumber=500.0)
     roots = [SquareRoot(bias=bias, floor=bias / 20, gain=2e4, straight=straight) for bias in (0.4, 0.9, 0.2)]
-    entry, twin = (RealtimeEntry(friction_controller(wanted)) for _ in range(2))
-    entry.set_root(roots[0])
+    root = ShapedDriver(Port(RATE, BLOCK, BLOCK, 1, 2), roots[0])
+    entry, twin = (RealtimeEntry(friction_controller(wanted), converter=each) for each in (root, None))
     sensed, n = 1e-7 * rng.standard_normal((1000, 2)), round(FADE * RATE)
     for each in (entry, twin):
         each.finger(-0.01, 0.05)
     drive, _ = plain(twin, abs(sensed))
     assert abs(drive).max() > 0.0
     np.testing.assert_allclose(plain(entry, sensed[:500])[0], roots[0](drive[:500]), rtol=1e-12)
-    entry.set_root(roots[1])
+    root.reshape(roots[1])
     rising = plain(entry, sensed[500 : 500 + n])[0]
     assert (rising > roots[0](drive[500 : 500 + n])).all()
     assert (rising[: n // 3] < roots[1](drive[500 : 500 + n // 3])).all()
-    entry.set_root(roots[2])
+    root.reshape(roots[2])
     np.testing.assert_allclose(plain(entry, sensed[500 + n :])[0], roots[1](drive[500 + n :]), rtol=1e-12)
     entry.silence()
     fading, rest = np.split(plain(entry, sensed[:20])[0], [round(FADE_OUT * RATE)])
