@@ -85,8 +85,7 @@ class RealtimeEntry(Addressed):
     frames : int, samples, optional
         Of a call, a multiple of the controller's block, which it is unless given; `log` needs it.
     converter : WrappedDriver, optional
-        What is between controller and device, such as a square root: compiled steps `sense` (before the controller)
-        and `act` (after it) or None, their `state`, and `hold`, the samples of the device in one of the controller.
+        What is between controller and device, such as a square root (see `hapticrender.renderers.shaped`).
 
     Attributes
     ----------
@@ -119,9 +118,8 @@ class RealtimeEntry(Addressed):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
         self.controller = controller
         self.converter, self.rate = converter, float(controller.rate)
-        self.hold = 1 if converter is None else int(converter.hold)
-        self.block = controller.block * self.hold
-        self.frames = controller.block if frames is None else frames
+        rows, hold = (controller.block, 1) if converter is None else (converter.block, converter.hold)
+        self.block, self.frames = rows * hold, rows if frames is None else frames
         bound = f"a multiple of the controller's block of {controller.block} samples"
         require(self.frames > 0 and self.frames % controller.block == 0, "frames", frames, bound)
         self.whole = controller.bands.envelope is None
@@ -157,7 +155,6 @@ class RealtimeEntry(Addressed):
             "places": np.zeros((2, block)),
             "waveform": np.zeros(block),
             "flags": np.zeros(block, np.int64),
-            "finger": np.zeros((block, 2)),
             "bump": np.zeros(controller.channels),
             "gains": np.zeros((self.ahead + block, 2)),
             "copies": np.zeros((COPIES, WORDS), np.int64),
@@ -165,22 +162,17 @@ class RealtimeEntry(Addressed):
         }
 
     def _converted(self) -> dict[str, Any]:
-        """Fields of the record for what is between controller and device: buffers of its own, or the controller's."""
-        converter, arrays = self.converter, self._arrays
-        steps = {name: getattr(converter, name, None) for name in ("sense", "act")}
-        if converter is not None:
-            arrays["played"] = np.zeros((self.block, self.controller.channels))
-        if steps["sense"] is not None:
-            arrays["given"] = np.zeros((self.block, self.controller.sensors))
-        buffers = {"played": arrays.get("played", arrays["drive"]), "given": arrays.get("given", arrays["sensed"])}
-        shared = {name: arrays[name] for name in ("drive", "sensed", "finger", "flags")}
-        self._conversion = record_of(CONVERSION, **shared, **buffers)
+        """Fields of the record for what is between controller and device; its signals are those of a call."""
+        between = self.converter
+        if between is None:
+            arrays = {name: self._arrays[name] for name in ("drive", "sensed")}
+            self._conversion = record_of(CONVERSION, **arrays, played=arrays["drive"], given=arrays["sensed"])
+            return {"unit": self.controller.block, "hold": 1, "conversion": self._conversion}
+        steps = {"sense": between.sense, "act": between.act}
         return {
-            **{f"{name}_at": array for name, array in buffers.items()},
             **{name: each.address for name, each in steps.items() if each is not None},
-            "conversion": self._conversion,
-            "converter": 0 if converter is None else converter.state,
-            "hold": self.hold,
+            **{"unit": between.block, "hold": between.hold},
+            **{"conversion": between.conversion, "converter": between.state},
         }
 
     def _start(self) -> dict[str, Any]:

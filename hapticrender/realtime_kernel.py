@@ -38,9 +38,11 @@ CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
     "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
-    "tracker sensed_scale_at drive_scale_at act sense converter conversion played_at given_at finger_at"
+    "tracker sensed_scale_at drive_scale_at act sense converter conversion"
 )
-_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken hold"
+_COUNTS = (
+    "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken hold unit"
+)
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
 _STATE = "gain touch place pace offset offset_input lead lead_input open level"
 _SETTINGS = "rate fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
@@ -278,32 +280,34 @@ def stop(entry):
 
 
 @kernel
-def sense(entry, slot):
-    """Convert what the device gives to what the controller senses, where something is between them."""
-    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
-    if e.sense != 0:
-        finger, position = carray(pointer(e.finger_at, F8), (e.block, 2)), carray(pointer(e.position_at, F8), e.block)
-        speed = s.velocity if e.age <= HORIZON * e.rate else 0.0
-        for m in range(e.block):
-            finger[m, 0], finger[m, 1] = s.load, speed if position[m] == position[m] else np.nan
-        call(e.sense, (e.converter, e.conversion, 0, e.block * e.hold))
+def sense(entry):
+    """Convert what the device has given in a unit to what the controller senses, where something is between them."""
+    e = record(entry, ENTRY_T, 0)
+    s, c = record(e.slots_at, SLOT_T, e.slot), record(e.conversion, CONVERSION_T, 0)
+    finger, flags = carray(pointer(c.finger, F8), (e.unit, 2)), carray(pointer(c.flags, I8), e.unit)
+    c.lost = e.lost & OVERRUN
+    flags[:] = 0
+    for m in range(e.unit):
+        finger[m, 0] = s.load
+        finger[m, 1] = (s.velocity if e.age < HORIZON * e.rate else 0.0) if s.position == s.position else np.nan
+    call(e.sense, (e.converter, e.conversion, 0, e.unit * e.hold))
+    for m in range(e.unit):
+        e.lost |= flags[m]
 
 
 @kernel
-def act(entry, slot):
-    """Convert the drive to what is played, where something is between them; that fades at rest, as it has a bias."""
-    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
+def act(entry):
+    """Convert the drive of a unit to what is played; that fades at rest, as zero drive is a bias."""
+    e = record(entry, ENTRY_T, 0)
     if e.act != 0:
-        call(e.act, (e.converter, e.conversion, 0, e.block))
-    if e.converter != 0:
-        played, rests = (
-            carray(pointer(e.played_at, F8), (e.block * e.hold, e.channels)),
-            e.stopped >= 0 or s.playing == 0,
-        )
-        for m in range(e.block * e.hold):
-            e.level = max(e.level - e.closing_step / e.hold, 0.0) if rests else 1.0
-            for i in range(e.channels):
-                played[m, i] *= e.level
+        call(e.act, (e.converter, e.conversion, 0, e.unit))
+    s, c = record(e.slots_at, SLOT_T, e.slot), record(e.conversion, CONVERSION_T, 0)
+    played = carray(pointer(c.played, F8), (e.unit * e.hold, e.channels))
+    for m in range(e.unit * e.hold):
+        rests = e.stopped >= 0 or s.playing == 0
+        e.level = max(e.level - e.closing_step / e.hold, 0.0) if rests else 1.0
+        for i in range(e.channels):
+            played[m, i] *= e.level
 
 
 @kernel
@@ -327,23 +331,20 @@ def foresee(entry, slot, path):
 
 @kernel
 def advance(entry):
-    """Advance the controller by the block that the device has given; returns all flags of the block."""
+    """Advance the controller by the block that is in its `sensed`; returns all flags of the block."""
     e = record(entry, ENTRY_T, 0)
     flags, drive = carray(pointer(e.flags_at, I8), e.block), carray(pointer(e.drive_at, F8), e.block * e.channels)
     slot = receive(entry)
     watch(entry, slot)
     play_texture(entry, slot)
     flags[:] = e.lost
-    record(e.conversion, CONVERSION_T, 0).lost = e.lost & OVERRUN
     e.lost = 0
-    sense(entry, slot)
     if record(slot, SLOT_T, 0).playing > 0 and not (e.timed_out > 0 and e.open == 0.0):
         run_controller(entry)
     else:
         drive[:] = 0.0
     raised = stop(entry)
     write_log(entry, slot)
-    act(entry, slot)
     e.flags |= raised
     swap(entry + SAMPLES_AT, e.samples + e.block)  # the log's rows are there for whoever reads the count
     keep(entry, slot)
@@ -352,27 +353,39 @@ def advance(entry):
 
 @kernel
 def carry(entry, sensed, drive, frames, dtype, scaled):
-    """Advance by blocks of samples of `dtype` at two addresses, full scales where `scaled`, else in SI units.
+    """Advance by units of samples of `dtype` at two addresses, full scales where `scaled`, else in SI units.
 
-    Returns the flags, or -1 and zeros where it refuses.
+    A unit is a block of the controller or, where something is between it and the device, a call.  Returns the flags, or
+    -1 and zeros where it refuses.
     """
-    e, count = record(entry, ENTRY_T, 0), int(frames)
+    e, count, raised = record(entry, ENTRY_T, 0), int(frames), 0
+    c, samples = record(e.conversion, CONVERSION_T, 0), e.unit * e.hold
     out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
-    if count % (e.block * e.hold) or (sensed == 0 and e.sensors > 0) or drive == 0:
+    if count % samples or (sensed == 0 and e.sensors > 0) or drive == 0:
         e.refused += 1
         out[:] = 0.0
         return -1
-    given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
-    inputs, outputs = e.block * e.hold * e.sensors, e.block * e.hold * e.channels
-    own, result = carray(pointer(e.given_at, F8), inputs), carray(pointer(e.played_at, F8), outputs)
-    units = carray(pointer(e.sensed_scale_at, F8), e.sensors)
-    scales = carray(pointer(e.drive_scale_at, F8), e.channels)
-    for block in range(count // (e.block * e.hold)):
+    inputs, outputs = samples * e.sensors, samples * e.channels
+    source, given = carray(pointer(sensed, dtype), count * e.sensors), carray(pointer(c.given, F8), inputs)
+    played = carray(pointer(c.played, F8), outputs)
+    own, result = carray(pointer(e.sensed_at, F8), e.block * e.sensors), carray(pointer(e.drive_at, F8), 1)
+    all_sensed, all_drive = carray(pointer(c.sensed, F8), e.unit * e.sensors), carray(pointer(c.drive, F8), 1)
+    units, scales = carray(pointer(e.sensed_scale_at, F8), e.sensors), carray(pointer(e.drive_scale_at, F8), 1)
+    for unit in range(count // samples):
         for i in range(inputs):
-            own[i] = given[block * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
-        raised |= advance(entry)
+            given[i] = source[unit * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
+        if e.sense != 0:
+            sense(entry)
+        for first in range(0, e.unit, e.block):
+            for i in range(e.block * e.sensors):
+                own[i] = all_sensed[first * e.sensors + i]
+            raised |= advance(entry)
+            for i in range(e.block * e.channels):
+                all_drive[first * e.channels + i] = result[i]
+        if e.converter != 0:
+            act(entry)
         for i in range(outputs):
-            out[block * outputs + i] = result[i] * (scales[i % e.channels] if scaled else 1.0)
+            out[unit * outputs + i] = played[i] * (scales[i % e.channels] if scaled else 1.0)
     return raised
 
 

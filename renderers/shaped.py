@@ -101,6 +101,8 @@ class WrappedDriver:
             "finger": np.zeros((rows, 2)),
             "flags": np.zeros(rows, np.int64),
         }
+        if self.sense is None:
+            self.signals["sensed"] = self.signals["given"]
         self.conversion = record_of(CONVERSION, **self.signals)
 
     def put(self, drive: Array) -> Sensed:

@@ -10,14 +10,32 @@ import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
 import jack_ring
 import numpy as np
 import pytest
-from jack_ring import BLOCK, CLIENT, METRES, NOISE, RATE, ROUND_TRIP, driver, entry_for, lost_callbacks, relative_errors
+from jack_ring import (
+    BLOCK,
+    CLIENT,
+    FAST,
+    METRES,
+    NOISE,
+    PEAK,
+    RATE,
+    ROUND_TRIP,
+    SHORT,
+    VIBRATION,
+    VOLTS,
+    System,
+    driver,
+    entry_for,
+    lost_callbacks,
+    relative_errors,
+)
+from scipy.signal import hilbert
 from test_player_textures import MOVING
 from waves import phasor
 
@@ -27,7 +45,9 @@ from hapticrender.control.probe import probe_plate
 from hapticrender.drivers import portaudio
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.errors import DeviceFault, DeviceNotFound, DriverError
+from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.plate import PlateParameters
+from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Flag
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
@@ -412,6 +432,100 @@ def test_a_hybrid_is_played_by_the_compiled_callback_and_changes_its_texture(con
             moved, friction = (phasor(each, frequency, RATE) for each in (true[:, :2].mean(axis=1), true[:, 2]))
             skin = 2j * np.pi * frequency * METRES * moved + VELOCITY_PER_FORCE * jack_ring.FRICTION * friction
             assert abs(skin) == pytest.approx(10e-3, rel=0.01)
+
+
+@pytest.fixture
+def fast(jack_program, tmp_path):
+    """Function that connects a system to a card at `FAST`; returns it, and the card's driver for `Player`.
+
+    From when the card is open until it closes every period waits for all clients, and lasts 8 ms until `play` returns.
+    """
+
+    class Card(AudioDriver):
+        def _open(self):
+            super()._open()
+            for each in ("free 1", "pace 8"):
+                self.system.say(each)
+
+        def close(self):
+            if self.active:
+                for each in ("pace 0", "free 0"):
+                    self.system.say(each)
+            super().close()
+
+    def run(system, *channels, noise=0.0, **options):
+        card = Card(CLIENT, *channels, rate=FAST, block=SHORT, **options)
+        card.system = stack.enter_context(
+            jack_ring.device(jack_program, tmp_path, system, length=round(20 * FAST), noise=noise)
+        )
+        return card.system, card
+
+    with jack_ring.server(tmp_path, "fast", FAST, SHORT), ExitStack() as stack:
+        yield run
+
+
+def play_fast(device, kind, card, texture, path, **tables):
+    """Play under a sliding finger, 0.4 s, then 0.3 s that are recorded; the recording, and the device's last sample."""
+    speed, load = 0.08, 0.4
+    with hr.Player(kind, card, **tables) as player:
+        player.finger(-0.08, speed, load)
+        player.play(texture)
+        device.say("pace 0")
+        for end in (0.4, 0.7):
+            while player.time < end:
+                player.finger(-0.08 + speed * player.time, speed, load)
+                player.sleep(0.004)
+            if end == 0.4:
+                player.record(path)
+        last = device.say("count").periods * SHORT
+        return player.end_recording(), last
+
+
+def test_an_ultrasonic_surface_is_played_by_the_compiled_callback(fast, tmp_path):
+    """Probed, then in closed loop over 32 samples at 192 kHz, by the friction that its amplitude leaves, and truly."""
+    load, frequency = 0.4, 100.0
+    scales = {"drive_per_full_scale": VOLTS, "sensed_per_full_scale": VIBRATION}
+    device, card = fast(jack_ring.vibrating(load), (1,), (1,), noise=2e-9 / VIBRATION, delay=2 * SHORT, **scales)
+    texture = hr.Grating(frequency=frequency, velocity=10e-3)
+    recording, last = play_fast(device, "ultrasonic", card, texture, tmp_path / "live.au")
+    here = slice(-round(0.2 * recording.rate), None)
+    wanted, found = (
+        phasor(each[here], frequency, recording.rate) for each in (recording.reference, recording.motion[:, 0])
+    )
+    print(found / wanted, abs(wanted), recording.flags.max(), recording.header.motion_source)
+    true = device.recorded(tmp_path / "record")[0][last - round(0.25 * FAST) : last, 0] * VIBRATION
+    amplitude = abs(hilbert(true.astype(float)))[round(0.03 * FAST) : round(0.23 * FAST)]
+    surface = SurfaceParameters()
+    friction = 0.8 * load * surface.friction_law.ratio(amplitude, load, 0.08)
+    truth = phasor(friction, frequency, FAST) * surface.lag_response(frequency, 0.08)
+    print(abs(truth) / abs(wanted))
+    assert abs(found / wanted - 1) < 0.01
+    assert abs(truth) == pytest.approx(abs(wanted), rel=0.01)
+    assert recording.header.motion_source == "inferred"
+
+
+def test_a_carrier_is_played_by_the_compiled_callback(fast, tmp_path):
+    """20 kHz at 192, in open loop: at its crests, every 48 samples, the attraction is that of the texture."""
+    load, frequency, speed = 0.4, 100.0, 0.08
+    device, card = fast(
+        System(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.eye(1)), (1,), (), drive_per_full_scale=PEAK
+    )
+    texture = hr.Grating(frequency=frequency, velocity=10e-3)
+    recording, last = play_fast(
+        device, "electroadhesion", card, texture, tmp_path / "live.au", rendering={"output": "carrier"}
+    )
+    played = device.recorded(tmp_path / "record")[0][:last, 0].astype(float)
+    played = played[np.flatnonzero(played)[0] :] * PEAK * np.sinc(5 / 48)
+    surface = ElectroadhesionParameters()
+    attraction = surface.gain(load) * played[::48] ** 2
+    here = slice(-round(0.2 * FAST / 48), None)
+    friction = surface.friction_coefficient * attraction[here]
+    truth = phasor(friction, frequency, FAST / 48) * surface.lag_response(frequency, speed)
+    wanted = phasor(recording.reference[-round(0.2 * recording.rate) :], frequency, recording.rate)
+    print(abs(truth) / abs(wanted), abs(wanted), recording.rate)
+    assert abs(truth) == pytest.approx(abs(wanted), rel=0.01)
+    turn = np.arange(len(played)) * 5 % 48 / 48
+    np.testing.assert_allclose(played[turn == 0.25], 0, atol=1e-9)
 
 
 @pytest.mark.parametrize(
