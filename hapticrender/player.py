@@ -6,7 +6,7 @@
 
 Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back
 (`start`, `stop`) is handed it as its callback; one whose controller runs on the device (`loop`) brings its own; any
-other, or what is behind a carrier that Python makes, is played by a thread.
+other is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
 Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.

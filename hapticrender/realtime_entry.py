@@ -100,7 +100,7 @@ class RealtimeEntry(Addressed):
     Raises
     ------
     TypeError
-        The controller has no compiled step.
+        The controller has no compiled step, or the converter none.
     ValueError
         A scale is out of its bound, or `frames` is no multiple of the block.
     """
@@ -116,6 +116,10 @@ class RealtimeEntry(Addressed):
     ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
+        if converter is not None and not hasattr(converter, "conversion"):
+            raise TypeError(
+                f"converter of type {type(converter).__name__}: must have compiled steps, as a WrappedDriver"
+            )
         self.controller = controller
         self.converter, self.rate = converter, float(controller.rate)
         rows, hold = (controller.block, 1) if converter is None else (converter.block, converter.hold)
