@@ -4,60 +4,16 @@ import math
 from dataclasses import dataclass
 from typing import Any, Self
 
-import numba
 import numpy as np
-from numba import carray
 
 from hapticrender.checks import require
 from hapticrender.control.supervisor import FADE_OUT
-from hapticrender.jit import CONVERSION, CONVERSION_T, F8, CFunction, pointer, record, record_of, step
+from hapticrender.defaults import FADE
+from hapticrender.jit import CONVERSION, CFunction, record_of
 from hapticrender.protocols import Array, Driver, Sensed
-from hapticrender.sampled_texture import FADE
+from hapticrender.renderers.conversions import ROOT, magnitude_sense, root_act
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
-ROOT = np.dtype(
-    [
-        *((name, np.int64) for name in ("channels", "sensors", "hold", "straight")),
-        *((name, np.float64) for name in ("bias", "goal", "rise", "floor", "gain", "turns", "turn", "crest")),
-    ]
-)
-"""Square root for the last channel: its bias (state; N), the bias that it rises to, by how much of it a sample, its
-floor (over the bias) and gain (N/A^2), whether there is no root; the carrier's phase (state) and turns a sample of the
-device, 0 where only its peak is played, and its crest."""
-ROOT_T = numba.from_dtype(ROOT)
-
-
-@step
-def root_act(state, signals, start, count):
-    """Turn the last channel's drive (N) into a carrier's peak (A), or the carrier, by the square root around a bias.
-
-    The bias never falls; while there is none the drive is zero.
-    """
-    r, io = record(state, ROOT_T, 0), record(signals, CONVERSION_T, 0)
-    drive = carray(pointer(io.drive, F8), (start + count, r.channels))
-    played = carray(pointer(io.played, F8), ((start + count) * r.hold, r.channels))
-    for n in range(start, start + count):
-        r.bias, peak = max(r.bias, min(r.bias + r.rise * r.goal, r.goal)), 0.0
-        if r.bias > 0.0:
-            attraction = max(r.bias + drive[n, r.channels - 1], r.floor * r.bias) / r.gain
-            peak = attraction / np.sqrt(2 * r.bias / r.gain) if r.straight > 0 else np.sqrt(attraction)
-        for k in range(r.hold):
-            for i in range(r.channels - 1):
-                played[n * r.hold + k, i] = drive[n, i]
-            played[n * r.hold + k, r.channels - 1] = peak * r.crest * np.cos(2 * np.pi * (r.turns + k * r.turn))
-        r.turns = (r.turns + r.hold * r.turn) % 1.0
-    return 0
-
-
-@step
-def magnitude_sense(state, signals, start, count):
-    """Take what is sensed as a magnitude."""
-    r, io = record(state, ROOT_T, 0), record(signals, CONVERSION_T, 0)
-    end = (start + count) * r.sensors
-    given, sensed = carray(pointer(io.given, F8), end), carray(pointer(io.sensed, F8), end)
-    for n in range(start * r.sensors, end):
-        sensed[n] = abs(given[n])
-    return 0
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from hapticrender.control.supervisor_kernel import JUMP_NEIGHBOURS
 from hapticrender.jit import kernel, record
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
-from hapticrender.renderers import resonant
+from hapticrender.renderers import conversions
 
 START = 0.3  # s: when the sensor fails
 ZERO = 2e-3  # s from the stop to zero drive
@@ -137,7 +137,7 @@ def test_no_finger_makes_a_tribometer_jump(leak, block):
 @kernel
 def jumped(state, values):
     """Whether a vibration jumps in a block (m)."""
-    return resonant.jumps(record(state, resonant.RESONANT_T, 0), values, 0, len(values), False)
+    return conversions.jumps(record(state, conversions.RESONANT_T, 0), values, 0, len(values), False)
 
 
 def test_a_vibration_that_jumps_is_found_at_any_phase_and_a_healthy_one_never_jumps(rng):
