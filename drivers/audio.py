@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import number
+from hapticrender.checks import scales
 from hapticrender.drivers.audio_callback import AHEAD, SLOTS, BlockQueue, Relay
 from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.portaudio import Stream, cards, find
 from hapticrender.errors import DeviceLost, DeviceNotFound, DeviceTimeout, DriverError
 from hapticrender.protocols import Array, Flag, Sensed
+from hapticrender.touch.device_profile import Scales
 
 RATE, BLOCK = 48000.0, 64  # Hz, samples a callback; unless they are given
 TIMEOUT = 2.0  # s: longest wait for a block
@@ -54,10 +55,11 @@ class AudioDriver(BaseDriver):
         Frames a callback.
     latency : "low", "high", float or (float, float)
         Requested of PortAudio: the card's own low or high latency, or seconds (input, output).
-    drive_per_full_scale : float, A, > 0
-        Drive at which an output is at full scale (V for a device driven by a voltage); 3 unless given.
-    sensed_per_full_scale : float, m, > 0, optional
-        Displacement at which an input is at full scale.
+    drive_per_full_scale : float or tuple of float, A, > 0
+        Drive at which an output is at full scale (V for a device driven by a voltage), of all or of each of `channels`;
+        3 unless given.
+    sensed_per_full_scale : float or tuple of float, m, > 0, optional
+        Displacement (or friction, N) at which an input is at full scale, of all or of each of `sensed_channels`.
     delay : float, samples, >= block, optional
         Of the card with its buffers, as ``hapticrender latency`` measures it with this rate, block and latency.
 
@@ -78,8 +80,8 @@ class AudioDriver(BaseDriver):
         rate: float = RATE,
         block: int = BLOCK,
         latency: Any = "low",
-        drive_per_full_scale: float = FULL_SCALE,
-        sensed_per_full_scale: float | None = None,
+        drive_per_full_scale: Scales = FULL_SCALE,
+        sensed_per_full_scale: Scales | None = None,
         delay: float | None = None,
     ) -> None:
         if sensed_channels is None:
@@ -93,15 +95,13 @@ class AudioDriver(BaseDriver):
         self.channels, self.inputs = _channels("channels", channels), _channels("sensed_channels", sensed_channels)
         if not self.channels:
             raise ValueError("channels=(): must name at least one output, such as (1, 2)")
-        scales = {"drive_per_full_scale": drive_per_full_scale, "sensed_per_full_scale": sensed_per_full_scale}
-        for name, value in scales.items():
-            if value is not None:
-                number(name, value, above=0.0)
+        drive = np.array(scales("drive_per_full_scale", drive_per_full_scale, len(self.channels)))
+        sensed = 1.0 if sensed_per_full_scale is None else sensed_per_full_scale
+        self.sensed_scale = 1.0 * np.array(scales("sensed_per_full_scale", sensed, len(self.inputs)))
         if delay is not None and not block <= delay <= LONGEST * rate:
             raise ValueError(f"{delay=} samples: must be >= block = {block} and <= {LONGEST:g} s")
         self.drive_per_full_scale, self.sensed_per_full_scale = drive_per_full_scale, sensed_per_full_scale
-        self.drive_limit = drive_per_full_scale
-        self.sensed_scale, self.drive_scale = sensed_per_full_scale or 1.0, 1.0 / drive_per_full_scale  # of an entry
+        self.drive_limit, self.drive_scale = float(drive.min()), 1.0 / drive
         needed = {"delay": delay, "sensed_per_full_scale (m)": sensed_per_full_scale}
         self._unknown = [name for name, value in needed.items() if value is None and self.inputs]
         self._stream: Stream | None = None
@@ -128,8 +128,8 @@ class AudioDriver(BaseDriver):
         """Make a driver of the first output and the first input (1 unless given), both in full scales."""
         options = {"rate": self.rate, "block": self.block, "latency": self.latency, "delay": float(self.block)}
         channels, inputs = self.channels[:1], (self.inputs or (1,))[:1]
-        scales = {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0}
-        driver = AudioDriver(self.device, channels, inputs, **options, **scales)
+        options |= {"drive_per_full_scale": 1.0, "sensed_per_full_scale": 1.0}
+        driver = AudioDriver(self.device, channels, inputs, **options)
         driver._ahead, driver.host_delay = FAR_AHEAD, (1 + FAR_AHEAD) * self.block
         return driver
 
@@ -205,7 +205,7 @@ class AudioDriver(BaseDriver):
         flags |= OVERRUN if number > self._number else 0
         self._lost += flags != 0
         self._number = number + 1
-        raised = np.where(np.any(abs(drive) > self.drive_per_full_scale, axis=1), SATURATED, 0) | flags
+        raised = np.where(np.any(abs(drive * self.drive_scale) > 1.0, axis=1), SATURATED, 0) | flags
         return Sensed(sensed * self.sensed_scale, flags=raised)
 
     def _wait_for(self, number: int) -> None:

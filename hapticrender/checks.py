@@ -101,6 +101,15 @@ def numbers(
     return tuple(found.tolist())
 
 
+def scales(key: str, value: Any, channels: int = 0) -> float | tuple[float, ...]:
+    """Return a finite number > 0 as float, or a list of them, one each of `channels` (0: any), as floats."""
+    if not isinstance(value, list | tuple | np.ndarray) or np.ndim(value) == 0:
+        return number(key, value, above=0.0)
+    bound = f"a number, or a list of {channels or 'one a channel'}"
+    require(len(value) == (channels or len(value) or 1), key, value, bound)
+    return tuple(number(f"{key}[{i}]", each, above=0.0) for i, each in enumerate(value))
+
+
 def frequencies(value: Any, *, zero: bool) -> np.ndarray[Any, Any]:
     """Return frequencies (Hz) as an array, if all are finite and > 0, or `zero`."""
     hertz = np.asarray(value, float)

@@ -13,6 +13,8 @@ from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hapticrender.errors import DriverError, HapticError
 from hapticrender.formatting import table
 
@@ -100,8 +102,9 @@ def check_calibration(driver: "Driver", profile: "DeviceProfile") -> None:
     An attribute of the entry's name and value says that it was taken; a `delay` may be longer.
     """
 
-    def takes(name: str, value: float) -> bool:
-        return getattr(driver, name, None) == value or (name == "delay" and getattr(driver, name, 0) >= value - 0.5)
+    def takes(name: str, value: Any) -> bool:
+        taken: Any = getattr(driver, name, None)
+        return np.array_equal(taken, value) or (name == "delay" and getattr(driver, name, 0) >= value - 0.5)
 
     if _MADE.get(id(driver)) is not driver and not hasattr(driver, "plant"):
         warn_of_calibration(type(driver).__name__, profile, takes)
@@ -110,7 +113,8 @@ def check_calibration(driver: "Driver", profile: "DeviceProfile") -> None:
 def warn_of_calibration(who: str, profile: "DeviceProfile | None", takes: Callable[[str, float], Any]) -> None:
     """Warn of the entries of a calibration that a driver does not take; `gain_uncertainty` is the recording's."""
     stated = {name: getattr(profile and profile.calibration, name, None) for name in SCALES}
-    lost = [f"{name} = {value:g}" for name, value in stated.items() if value is not None and not takes(name, value)]
+    shown = {name: np.atleast_1d(each) for name, each in stated.items() if each is not None and not takes(name, each)}
+    lost = [f"{name} = {', '.join(f'{each:g}' for each in values)}" for name, values in shown.items()]
     if lost:
         cure = "give a driver these numbers itself, and keep them as its attributes, or a parameter of that name"
         problem = f"{', '.join(lost)}: {who} does not take it, so it has no effect: {cure}"

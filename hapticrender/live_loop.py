@@ -87,7 +87,9 @@ class LiveLoop(RealtimeEntry):
     """
 
     def __init__(self, rendering: Rendering, **scales: float) -> None:
-        super().__init__(live_controller(rendering), frames=rendering.driver.block, **scales)
+        wrapped = bool(scales) and rendering.driver is not rendering.device
+        converter = rendering.driver if wrapped else None
+        super().__init__(live_controller(rendering), frames=rendering.driver.block, converter=converter, **scales)
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         self._calls_back = bool(scales)
@@ -105,8 +107,6 @@ class LiveLoop(RealtimeEntry):
         own = rendering.plant is not None
         self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
-        if self._calls_back and rendering.driver is not rendering.device:
-            self.set_root(rendering.shape)
         self.play(self._texture(rendering))
 
     @property
@@ -218,8 +218,8 @@ class LiveLoop(RealtimeEntry):
         if controller is not self.controller:
             ready(controller)
         self.play(texture, controller)
-        if rendering.shape is not None and self._calls_back:
-            self.set_root(rendering.shape)
+        if rendering.shape is not None and hasattr(self._device, "reshape"):
+            self._device.reshape(rendering.shape)
         elif rendering.shape is not None:
             self._reshaping = self._device.shape, rendering.shape, self.samples
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
@@ -289,12 +289,6 @@ class LiveLoop(RealtimeEntry):
             if self._calls_back:  # by a callback without Python's lock
                 return ForeseenTexture(rendering, self.ahead, self.foreseen(sampled_texture.PIECE)[1])
         return EvaluatedTexture(rendering, self.ahead, self._arrays["places"], self._arrays["position"])
-
-
-def is_called_back(rendering: Rendering) -> bool:
-    """Return whether the device calls the controller back, and what is before it is compiled."""
-    direct = rendering.driver is rendering.device
-    return hasattr(rendering.device, "start") and bool(getattr(rendering.driver, "calls_back", direct))
 
 
 def live_controller(rendering: Rendering) -> Controller:

@@ -6,7 +6,7 @@
 
 Controller and renderers are those of `render`; a `LiveLoop` advances them block by block.  A driver that calls back
 (`start`, `stop`) is handed it as its callback; one whose controller runs on the device (`loop`) brings its own; any
-other, or what is behind a carrier that Python makes, is played by a thread.
+other is played by a thread.
 
 A texture fades into the next one under the same controller, which keeps what it has learned of finger and device.
 Where the controller works by bands (hybrids) each texture has one, which goes on from the state of the one before.
@@ -31,7 +31,7 @@ from hapticrender.control.carriers import FASTEST
 from hapticrender.devices import open_driver
 from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, noted_on
 from hapticrender.jit import Addressed
-from hapticrender.live_loop import LiveLoop, LiveMotion, is_called_back
+from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
 from hapticrender.loop import FADE_OUT, differences, opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_scene import scenes_of
@@ -338,11 +338,9 @@ class Player(Addressed):
         """Make the driver, start the device with the first scene's texture, and prepare those of the others."""
         given = self._driver
         driver: Any = open_driver(given, scenes[0].device_profile) if isinstance(given, str) else given
-        live = driver.live() if hasattr(driver, "live") else driver
+        live = driver.live() if hasattr(driver, "live") and hasattr(driver, "start") else driver
         try:
             rendering = prepare(scenes[0], driver=live, compiled=False)
-            if live is not driver and not is_called_back(rendering):  # a thread plays it, later than a callback
-                rendering = prepare(scenes[0], driver=driver, compiled=False)
             return self._start(rendering, scenes[1:])
         except BaseException as error:
             with noted_on(error), self._stack:  # what has been opened is left at rest
@@ -352,7 +350,7 @@ class Player(Addressed):
     def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:
         """Open the device at rest, probe it, prepare what plays later, and play."""
         device: Any = rendering.device
-        stack, calls_back = self._stack, is_called_back(rendering)
+        stack, calls_back = self._stack, hasattr(device, "start")
         own = rendering.driver is device and hasattr(device, "loop")
         blocks = 2 * rendering.driver.block / rendering.driver.rate
         self._timeout = TIMEOUT + blocks

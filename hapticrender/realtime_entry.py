@@ -21,11 +21,11 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import number, require
+from hapticrender.checks import number, require, scales
 from hapticrender.control.records import CONTROLLER
 from hapticrender.control.state_transfer import drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
-from hapticrender.jit import Addressed, CFunction, addresses, record_of
+from hapticrender.jit import CONVERSION, Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
 from hapticrender.realtime_kernel import (
     AUDIO,
@@ -78,18 +78,20 @@ class RealtimeEntry(Addressed):
     ----------
     controller : Controller
         With a compiled step; its state goes on here, so do not run it elsewhere meanwhile.
-    sensed_scale : float, m of full scale, > 0
-        Unit of a float sample of 1.0 at the input.
-    drive_scale : float, 1/A of full scale, > 0
-        Float sample at the output for a drive of 1 A.
+    sensed_scale : float or array of float, m of full scale, > 0
+        Unit of a float sample of 1.0 at the input, of all sensors or of each.
+    drive_scale : float or array of float, 1/A of full scale, > 0
+        Float sample at the output for a drive of 1 A, of all channels or of each.
     frames : int, samples, optional
         Of a call, a multiple of the controller's block, which it is unless given; `log` needs it.
+    converter : WrappedDriver, optional
+        What is between controller and device, such as a square root (see `hapticrender.renderers.shaped`).
 
     Attributes
     ----------
     user_data : int
         The pointer that belongs to both addresses.  The entry has to outlive whoever calls them.
-    block : int, samples
+    block : int, samples of the device
         Frames a call, or a multiple.
     whole : bool
         Whether the controller takes a waveform.  Of one with constant envelopes the gain is a factor of targets that
@@ -98,43 +100,57 @@ class RealtimeEntry(Addressed):
     Raises
     ------
     TypeError
-        The controller has no compiled step.
+        The controller has no compiled step, or the converter none.
     ValueError
         A scale is out of its bound, or `frames` is no multiple of the block.
     """
 
     def __init__(
-        self, controller: Any, *, sensed_scale: float = 1.0, drive_scale: float = 1.0, frames: int | None = None
+        self,
+        controller: Any,
+        *,
+        sensed_scale: float | Array = 1.0,
+        drive_scale: float | Array = 1.0,
+        frames: int | None = None,
+        converter: Any = None,
     ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
-        number("sensed_scale", sensed_scale, "m", above=0.0)
-        number("drive_scale", drive_scale, "1/A", above=0.0)
+        if converter is not None and not hasattr(converter, "conversion"):
+            raise TypeError(
+                f"converter of type {type(converter).__name__}: must have compiled steps, as a WrappedDriver"
+            )
         self.controller = controller
-        self.block, self.rate = controller.block, float(controller.rate)
-        self.frames = self.block if frames is None else frames
-        bound = f"a multiple of the controller's block of {self.block} samples"
-        require(self.frames > 0 and self.frames % self.block == 0, "frames", frames, bound)
+        self.converter, self.rate = converter, float(controller.rate)
+        rows, hold = (controller.block, 1) if converter is None else (converter.block, converter.hold)
+        self.block, self.frames = rows * hold, rows if frames is None else frames
+        bound = f"a multiple of the controller's block of {controller.block} samples"
+        require(self.frames > 0 and self.frames % controller.block == 0, "frames", frames, bound)
         self.whole = controller.bands.envelope is None
         self._slot, self._slots, self._back = np.zeros(1, SLOT), np.zeros(SLOTS, SLOT), 0
-        self._slot["position"], self._slot["playing"], self._slot["gain"], self._slot["root_gain"] = np.nan, 1, 1.0, 1.0
+        self._slot["position"], self._slot["playing"], self._slot["gain"] = np.nan, 1, 1.0
         self._slots[:] = self._slot
         self._textures: list[SampledTexture | EvaluatedTexture] = []
         self._writing = threading.Lock()  # of threads of the application; the callback never waits
         self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
+        for name, given, count in (
+            ("sensed_scale", sensed_scale, controller.sensors),
+            ("drive_scale", drive_scale, controller.channels),
+        ):
+            self._arrays[name] = np.resize(scales(name, given, count), count)
         self._signals = {name: self._arrays[name] for name in BLOCK}
         self._first = self._control = _Control(controller, self._signals)  # which may run without a texture
         fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
-        fields |= {"control": self._control.address, "tracker": self._tracker}
-        self._entry = record_of(ENTRY, **fields, sensed_scale=sensed_scale, drive_scale=drive_scale)
+        fields |= {"control": self._control.address, "tracker": self._tracker} | self._converted()
+        self._entry = record_of(ENTRY, **fields)
         self.user_data = int(self._entry.ctypes.data)
         self._arrays["copies"][:] = np.concatenate([self._entry.view(np.int64), self._slot.view(np.int64)])
 
     def _buffers(self) -> dict[str, Array]:
         """Signals of a block, gains that wait, and the log."""
-        controller, block = self.controller, self.block
+        controller, block = self.controller, self.controller.block
         rows = -(-round(LOG_TIME * self.rate) // block) * block + self.frames
         return {
             "sensed": np.zeros((block, controller.sensors)),
@@ -149,11 +165,29 @@ class RealtimeEntry(Addressed):
             "log": np.zeros((rows, controller.channels + controller.sensors + 4)),
         }
 
+    def _converted(self) -> dict[str, Any]:
+        """Fields of the record for what is between controller and device; its signals are those of a call."""
+        between = self.converter
+        if between is None:
+            arrays = {name: self._arrays[name] for name in ("drive", "sensed")}
+            self._conversion = record_of(CONVERSION, **arrays, played=arrays["drive"], given=arrays["sensed"])
+            return {"unit": self.controller.block, "hold": 1, "conversion": self._conversion}
+        steps = {"sense": between.sense, "act": between.act}
+        return {
+            **{name: each.address for name, each in steps.items() if each is not None},
+            **{"unit": between.block, "hold": between.hold},
+            **{"conversion": between.conversion, "converter": between.state},
+        }
+
     def _start(self) -> dict[str, Any]:
         """Numbers of the record at rest."""
         log, rate = self._arrays["log"], self.rate
         return {
-            **{"block": self.block, "sensors": self.controller.sensors, "channels": self.controller.channels},
+            **{
+                "block": self.controller.block,
+                "sensors": self.controller.sensors,
+                "channels": self.controller.channels,
+            },
             **{"middle": 1, "slot": 2, "stopped": -1, "gain": 1.0, "open": 1.0, "place": np.nan, "rate": rate},
             **{"ahead": self.ahead, "log_rows": log.shape[0], "log_width": log.shape[1]},
             "age": round(HOLD * rate),
@@ -249,17 +283,6 @@ class RealtimeEntry(Addressed):
         """Set the factor on the texture, finite; it is reached to 1 % within 50 ms."""
         self._set(gain=number("gain", gain))
 
-    def set_root(self, root: Any) -> None:
-        """Let the last channel be the peak of a screen's carrier (A), by its `SquareRoot`; None: none yet, zero.
-
-        First before the entry is called, which then has no drive at rest, and of a screen alone senses magnitudes;
-        another bias is reached within `FADE`, a smaller one is not taken.
-        """
-        if root is not None:
-            self._set(bias=root.bias, floor=root.floor / root.bias, root_gain=root.gain, straight=root.straight)
-            self._entry["bias"] = self._entry["bias"] if self._entry["rooted"][0] else root.bias
-        self._entry["rooted"] = 1
-
     def watch(self, seconds: float | None = None) -> None:
         """Stop the drive permanently once neither this nor `alive` has been called for so long (s); None: never."""
         self._set("calls", watchdog=0.0 if seconds is None else seconds * self.rate)
@@ -276,8 +299,8 @@ class RealtimeEntry(Addressed):
         """
         while True:
             samples = self.samples
-            words = self._arrays["copies"][(samples // self.block - 1) % COPIES].copy()
-            if self.samples - samples < (COPIES - 2) * self.block:
+            words = self._arrays["copies"][(samples // self.controller.block - 1) % COPIES].copy()
+            if self.samples - samples < (COPIES - 2) * self.controller.block:
                 break
         path = np.zeros((2, self.ahead + round(seconds * self.rate) + 2 * self.frames))
         entry, slot = words[:ENTRY_WORDS].view(ENTRY), words[ENTRY_WORDS:]
@@ -296,7 +319,7 @@ class RealtimeEntry(Addressed):
         normal_load (N), reference (the whole texture) and flags, each shape (n,).
         """
         table, end = self._arrays["log"], self.samples
-        first = max(start, end - len(table) + 8 * self.block + self.frames, 0)
+        first = max(start, end - len(table) + 8 * self.controller.block + self.frames, 0)
         rows = table[np.arange(first, end) % len(table)]
         c, s = self.controller.channels, self.controller.sensors
         played = np.arange(first, end) - self.frames  # the drive of a call plays with the samples of the next one

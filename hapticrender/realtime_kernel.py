@@ -10,7 +10,7 @@ from numba import carray, types
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import transfer
-from hapticrender.jit import CALLBACK, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
+from hapticrender.jit import CALLBACK, CONVERSION_T, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
 from hapticrender.sampled_texture import FRESH, TEXTURE_T, evaluate, runs_out, smoothstep, value_at
 
@@ -25,13 +25,11 @@ F4 = types.float32
 SLOT = np.dtype(
     [
         *((name, np.float64) for name in ("position", "velocity", "load", "gain", "watchdog")),
-        *((name, np.float64) for name in ("bias", "floor", "root_gain")),
-        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls", "straight")),
+        *((name, np.int64) for name in ("playing", "texture", "finger_changes", "calls")),
     ]
 )
-"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), the square root of a
-screen (its floor over its bias), whether anything plays, the texture's record; how often it has set the finger, and
-called."""
+"""What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), whether anything plays,
+the texture's record; how often it has set the finger, and called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
 CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "shared", "limit_at")])
 """Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
@@ -40,12 +38,14 @@ CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
     "control slots_at sensed_at drive_at position_at places_at waveform_at flags_at bump_at gains_at log_at copies_at "
-    "tracker"
+    "tracker sensed_scale_at drive_scale_at act sense converter conversion"
 )
-_COUNTS = "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken rooted"
+_COUNTS = (
+    "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken hold unit"
+)
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
-_STATE = "gain touch place pace offset offset_input lead lead_input open bias level"
-_SETTINGS = "rate sensed_scale drive_scale fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
+_STATE = "gain touch place pace offset offset_input lead lead_input open level"
+_SETTINGS = "rate fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
 ENTRY = np.dtype(
     [
         *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
@@ -280,19 +280,34 @@ def stop(entry):
 
 
 @kernel
-def take_root(entry, slot):
-    """Turn the drive of the last channel (N) into the peak of a carrier (A), by the square root around a bias.
+def sense(entry):
+    """Convert what the device has given in a unit to what the controller senses, where something is between them."""
+    e = record(entry, ENTRY_T, 0)
+    s, c = record(e.slots_at, SLOT_T, e.slot), record(e.conversion, CONVERSION_T, 0)
+    finger, flags = carray(pointer(c.finger, F8), (e.unit, 2)), carray(pointer(c.flags, I8), e.unit)
+    c.lost = e.lost & OVERRUN
+    flags[:] = 0
+    for m in range(e.unit):
+        finger[m, 0] = s.load
+        finger[m, 1] = (s.velocity if e.age < HORIZON * e.rate else 0.0) if s.position == s.position else np.nan
+    call(e.sense, (e.converter, e.conversion, 0, e.unit * e.hold))
+    for m in range(e.unit):
+        e.lost |= flags[m]
 
-    The bias rises within `fade` and never falls; at rest the peak fades, as zero drive is the bias.
-    """
-    e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
-    drive = carray(pointer(e.drive_at, F8), (e.block, e.channels))[:, e.channels - 1]
-    rests = e.stopped >= 0 or s.playing == 0
-    for m in range(e.block):
-        e.bias = max(e.bias, min(e.bias + s.bias / e.fade, s.bias))
-        e.level = max(e.level - e.closing_step, 0.0) if rests else 1.0
-        attraction = max(e.bias + drive[m], s.floor * e.bias) / s.root_gain
-        drive[m] = e.level * (attraction / np.sqrt(2 * e.bias / s.root_gain) if s.straight > 0 else np.sqrt(attraction))
+
+@kernel
+def act(entry):
+    """Convert the drive of a unit to what is played; that fades at rest, as zero drive is a bias."""
+    e = record(entry, ENTRY_T, 0)
+    if e.act != 0:
+        call(e.act, (e.converter, e.conversion, 0, e.unit))
+    s, c = record(e.slots_at, SLOT_T, e.slot), record(e.conversion, CONVERSION_T, 0)
+    played = carray(pointer(c.played, F8), (e.unit * e.hold, e.channels))
+    for m in range(e.unit * e.hold):
+        rests = e.stopped >= 0 or s.playing == 0
+        e.level = max(e.level - e.closing_step / e.hold, 0.0) if rests else 1.0
+        for i in range(e.channels):
+            played[m, i] *= e.level
 
 
 @kernel
@@ -330,8 +345,6 @@ def advance(entry):
         drive[:] = 0.0
     raised = stop(entry)
     write_log(entry, slot)
-    if e.rooted > 0:
-        take_root(entry, slot)
     e.flags |= raised
     swap(entry + SAMPLES_AT, e.samples + e.block)  # the log's rows are there for whoever reads the count
     keep(entry, slot)
@@ -339,31 +352,46 @@ def advance(entry):
 
 
 @kernel
-def carry(entry, sensed, drive, frames, dtype, sensed_scale, drive_scale):
-    """Advance by blocks of samples of `dtype` at two addresses; returns the flags, or -1 and zeros where it refuses."""
-    e, count = record(entry, ENTRY_T, 0), int(frames)
+def carry(entry, sensed, drive, frames, dtype, scaled):
+    """Advance by units of samples of `dtype` at two addresses, full scales where `scaled`, else in SI units.
+
+    A unit is a block of the controller or, where something is between it and the device, a call.  Returns the flags, or
+    -1 and zeros where it refuses.
+    """
+    e, count, raised = record(entry, ENTRY_T, 0), int(frames), 0
+    c, samples = record(e.conversion, CONVERSION_T, 0), e.unit * e.hold
     out = carray(pointer(drive, dtype), count * e.channels if drive != 0 else 0)
-    if count % e.block or (sensed == 0 and e.sensors > 0) or drive == 0:
+    if count % samples or (sensed == 0 and e.sensors > 0) or drive == 0:
         e.refused += 1
         out[:] = 0.0
         return -1
-    given, raised = carray(pointer(sensed, dtype), count * e.sensors), 0
-    inputs, outputs = e.block * e.sensors, e.block * e.channels
-    own, result = carray(pointer(e.sensed_at, F8), inputs), carray(pointer(e.drive_at, F8), outputs)
-    for block in range(count // e.block):
+    inputs, outputs = samples * e.sensors, samples * e.channels
+    source, given = carray(pointer(sensed, dtype), count * e.sensors), carray(pointer(c.given, F8), inputs)
+    played = carray(pointer(c.played, F8), outputs)
+    own, result = carray(pointer(e.sensed_at, F8), e.block * e.sensors), carray(pointer(e.drive_at, F8), 1)
+    all_sensed, all_drive = carray(pointer(c.sensed, F8), e.unit * e.sensors), carray(pointer(c.drive, F8), 1)
+    units, scales = carray(pointer(e.sensed_scale_at, F8), e.sensors), carray(pointer(e.drive_scale_at, F8), 1)
+    for unit in range(count // samples):
         for i in range(inputs):
-            own[i] = sensed_scale * given[block * inputs + i]
-        if e.rooted > 0 and e.channels == 1:
-            own[:] = np.abs(own)  # friction, of a tribometer that keeps the sign of the lateral force
-        raised |= advance(entry)
+            given[i] = source[unit * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
+        if e.sense != 0:
+            sense(entry)
+        for first in range(0, e.unit, e.block):
+            for i in range(e.block * e.sensors):
+                own[i] = all_sensed[first * e.sensors + i]
+            raised |= advance(entry)
+            for i in range(e.block * e.channels):
+                all_drive[first * e.channels + i] = result[i]
+        if e.converter != 0:
+            act(entry)
         for i in range(outputs):
-            out[block * outputs + i] = drive_scale * result[i]
+            out[unit * outputs + i] = played[i] * (scales[i % e.channels] if scaled else 1.0)
     return raised
 
 
 def _plain(sensed, drive, frames, entry):
     """Advance by blocks of double samples in SI units; returns the flags, or -1 where it refuses."""
-    return carry(entry, sensed, drive, frames, F8, 1.0, 1.0)
+    return carry(entry, sensed, drive, frames, F8, False)
 
 
 def _audio(sensed, drive, frames, time, status, entry):
@@ -371,7 +399,7 @@ def _audio(sensed, drive, frames, time, status, entry):
     e = record(entry, ENTRY_T, 0)
     if status & LOST:
         e.lost = OVERRUN
-    return ABORT if carry(entry, sensed, drive, frames, F4, e.sensed_scale, e.drive_scale) < 0 else CONTINUE
+    return ABORT if carry(entry, sensed, drive, frames, F4, True) < 0 else CONTINUE
 
 
 PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))

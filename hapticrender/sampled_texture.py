@@ -16,6 +16,7 @@ import numba
 import numpy as np
 from numba import carray
 
+from hapticrender.defaults import FADE as FADE
 from hapticrender.jit import F8, Addressed, call, entry, kernel, pointer, record, record_of, swap
 from hapticrender.protocols import Array, Rendering, Texture
 from hapticrender.touch.composed import SeparatedTexture, evaluated
@@ -23,7 +24,6 @@ from hapticrender.touch.composed import SeparatedTexture, evaluated
 AHEAD = 2.0  # s: samples in time that are computed ahead; of a program that is later the texture fades out
 CHUNK = 4096  # samples computed at once
 STEP, REACH = 2e-6, 0.15  # m: of the profile, and to either side of the surface's middle
-FADE = 0.04  # s: of one texture into another, and of what ends
 PIECE, BLEND = 0.2, 5e-3  # s: evaluated at once of a texture in time and place; in which it fades over the one before
 SLOTS, FRESH = 3, 4  # pieces; bit beside the number of the one in the middle: not yet read
 

@@ -28,7 +28,7 @@ from hapticrender.renderers.base import BaseRenderer
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
 from hapticrender.renderers.limits import perceptible
-from hapticrender.renderers.shaped import Port, WrappedDriver
+from hapticrender.renderers.shaped import Port, ShapedDriver
 from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
 from hapticrender.touch.scene import Scene, scene_keys
 
@@ -51,19 +51,19 @@ class HybridSettings(Validated):
         return smoothstep(np.asarray(frequency, float) / self.start - 1.0)
 
 
-class HybridDriver(WrappedDriver):
+class HybridDriver(ShapedDriver):
     """A user's driver with the square root before the screen, and the skin's velocity computed from its sensors.
 
-    The driver takes both coils' drive (A), then the envelope of the screen's current (A, peak): `shape` of the
-    controller's.  It senses both ends of the plate (m), then friction (N), `late` (s); or nothing.  `displacement`
-    (2, 2) is heave (m) and tilt (rad) per sensor; velocity, a difference of two samples, waits for the friction.
+    The driver takes both coils' drive (A), then the envelope of the screen's current (A, peak).  It senses both ends of
+    the plate (m), then friction (N), `late` (s); or nothing.  `displacement` (2, 2) is heave (m) and tilt (rad) per
+    sensor; velocity, a difference of two samples, waits for the friction.
     """
 
-    calls_back = True
+    sense = None
 
-    def __init__(self, driver: Driver, shape: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
-        super().__init__(driver)
-        self.shape, self.motion_delay = shape, max(late, 0.5 / self.rate)  # s, of `motion`
+    def __init__(self, driver: Driver, root: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
+        super().__init__(driver, root)
+        self.motion_delay = max(late, 0.5 / self.rate)  # s, of `motion`
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
         self._waits = self.motion_delay * self.rate - 0.5  # samples, as a difference is half a sample late
         self.early = math.ceil(self._waits) + 1  # samples before those whose velocity is computed
@@ -71,9 +71,7 @@ class HybridDriver(WrappedDriver):
 
     def play(self, drive: Array) -> Sensed:
         """Play a block, the screen's drive as a current."""
-        drive = np.array(drive, float)
-        drive[:, COILS] = self.shape(drive[:, COILS])
-        sensed = self.put(drive)
+        sensed = self.put(self.convert(drive))
         if sensed.motion is not None or not self.sensed_channels:
             return sensed
         place = np.zeros(len(sensed.sensed)) if sensed.position is None else sensed.position
@@ -149,10 +147,9 @@ class HybridRenderer(BaseRenderer):
         plate = setup.plate.assumed
         model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
-        shape = np.zeros_like if setup.friction is None else setup.friction.compensation
         displacement = lever[:, None] * model.coordinate_from_sensed
         late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
-        return HybridDriver(driver, shape, displacement, setup.velocity_per_force, late)
+        return HybridDriver(driver, self.shape(setup), displacement, setup.velocity_per_force, late)
 
     def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes its plate, unless driver or scene say no."""

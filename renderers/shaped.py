@@ -1,7 +1,6 @@
-"""Drivers behind a static characteristic of their drive, which a renderer puts before a user's device."""
+"""Drivers behind a square root of their drive, or a carrier, which a renderer puts before a user's device."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -9,7 +8,10 @@ import numpy as np
 
 from hapticrender.checks import require
 from hapticrender.control.supervisor import FADE_OUT
+from hapticrender.defaults import FADE
+from hapticrender.jit import CONVERSION, CFunction, record_of
 from hapticrender.protocols import Array, Driver, Sensed
+from hapticrender.renderers.conversions import ROOT, magnitude_sense, root_act
 
 LEAST_SAMPLES = 4  # in a turn of a carrier
 
@@ -29,18 +31,35 @@ class Port:
 class WrappedDriver:
     """A driver whose drive or measurements are converted on the way; a subclass fills in `play`, by `put`.
 
-    While `resting` the device's own drive fades to zero: what zero drive of the controller becomes may be a bias.
+    Compiled steps do so: `act` makes `played` of the controller's drive, `sense` what the controller gets of `given`
+    (see `jit.CONVERSION`), from a `state`.  A `RealtimeEntry` takes the same steps where the device calls back.  A
+    sample of the controller is `hold` of the device.  While `resting` the device's own drive fades to zero: what zero
+    drive of the controller becomes may be a bias.
     """
 
     motion_source = "true"  # of the motion that `play` returns, where it does
     resting = False  # set by the loop from a stop on
-    calls_back = False  # whether a `RealtimeEntry` with the square root converts the drive as `play` does
+    act: CFunction | None = None
+    sense: CFunction | None = None
+    state: Array
 
-    def __init__(self, driver: Driver) -> None:
-        self.driver = driver
-        self.rate, self.block, self.delay = driver.rate, driver.block, driver.delay
+    def __init__(self, driver: Driver, hold: int = 1) -> None:
+        self.driver, self.hold = driver, hold
+        self.rate, self.block, self.delay = driver.rate / hold, max(driver.block // hold, 1), driver.delay // hold
         self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
         self._level = 1.0  # factor on the device's drive
+        rows, long = self.block, self.block * hold
+        self.signals = {
+            "drive": np.zeros((rows, self.drive_channels)),
+            "played": np.zeros((long, self.drive_channels)),
+            "given": np.zeros((long, self.sensed_channels)),
+            "sensed": np.zeros((rows, self.sensed_channels)),
+            "finger": np.zeros((rows, 2)),
+            "flags": np.zeros(rows, np.int64),
+        }
+        if self.sense is None:
+            self.signals["sensed"] = self.signals["given"]
+        self.conversion = record_of(CONVERSION, **self.signals)
 
     def put(self, drive: Array) -> Sensed:
         """Play a block of the device's own drive."""
@@ -53,6 +72,8 @@ class WrappedDriver:
         return self.driver.play(level[:, None] * drive)
 
     def __enter__(self) -> Self:
+        for each in (self.act, self.sense):
+            _ = each and each.address  # compiled before anything is live
         self.driver.__enter__()
         return self
 
@@ -69,56 +90,59 @@ def thinned(sensed: Sensed, hold: int) -> Sensed:
 
 
 class ShapedDriver(WrappedDriver):
-    """A driver that plays `shape` of its drive: the device's from the controller's, sample by sample (n, channels).
+    """A driver whose last channel plays a root of the drive: the peak of a carrier, sample by sample.
 
     What it senses, or knows, of the friction is taken as a magnitude: a tribometer that keeps the sign of the lateral
     force changes it with the finger's direction, and the friction does not.
     """
 
-    calls_back = True
+    act, sense = root_act, magnitude_sense
 
-    def __init__(self, driver: Driver, shape: Callable[[Array], Any]) -> None:
-        super().__init__(driver)
-        self.shape = shape
+    def __init__(self, driver: Driver, root: Any, hold: int = 1, turn: float = 0.0) -> None:
+        super().__init__(driver, hold)
+        numbers = {"channels": self.drive_channels, "sensors": self.sensed_channels, "hold": hold, "gain": 1.0}
+        numbers["rise"] = 1.0 / round(FADE * self.rate)
+        crest = 1.0 / float(np.sinc(turn))  # of a carrier behind the device's hold
+        self.state = record_of(ROOT, **numbers, turn=turn, crest=crest)
+        if root is not None:
+            self.reshape(root)
+            self.state["bias"] = root.bias
+
+    def reshape(self, root: Any) -> None:
+        """Let the bias rise to that of another `SquareRoot` within `FADE`; a smaller one is not taken."""
+        values = {"floor": root.floor / root.bias, "gain": root.gain, "straight": root.straight, "goal": root.bias}
+        for name, value in values.items():  # the goal last: a callback may run
+            self.state[name] = value
+
+    def convert(self, drive: Array) -> Array:
+        """Return what is played for a block of the controller's drive."""
+        self.signals["drive"][:] = drive
+        root_act(self.state.ctypes.data, self.conversion.ctypes.data, 0, self.block)
+        return self.signals["played"].copy()
 
     def play(self, drive: Array) -> Sensed:
-        """Play `shape` of a block."""
-        sensed = self.put(self.shape(drive))
+        """Play a block behind the root."""
+        sensed = self.put(self.convert(drive))
         motion = None if sensed.motion is None else np.abs(sensed.motion)
-        return sensed._replace(sensed=np.abs(sensed.sensed), motion=motion)
+        return thinned(sensed._replace(sensed=np.abs(sensed.sensed), motion=motion), self.hold)
 
 
 class CarrierDriver(ShapedDriver):
-    """A driver without sensors that plays the carrier itself: ``shape(drive) cos(2 pi frequency t)``.
+    """A driver without sensors that plays the carrier itself: ``root(drive) cos(2 pi frequency t)``.
 
     To the controller it is a device at a whole part of the driver's rate, whose drive is held: the lowest rate >=
     `envelope_rate` (Hz) that block and delay allow.  The carrier (`frequency`, Hz) starts at its crest, so that a
     device that blocks direct current keeps no charge.
     """
 
-    calls_back = False
+    sense = None
 
-    def __init__(
-        self, driver: Driver, shape: Callable[[Array], Any], *, frequency: float, envelope_rate: float
-    ) -> None:
+    def __init__(self, driver: Driver, root: Any, *, frequency: float, envelope_rate: float) -> None:
         senses, least = driver.sensed_channels, LEAST_SAMPLES * frequency
         bound = "0 where output = 'carrier'; a driver that senses gets the envelope"
         require(not senses, "driver.sensed_channels", senses, bound)
         bound = f">= {least:g} Hz where output = 'carrier', {LEAST_SAMPLES} samples a turn of {frequency:g} Hz"
         require(driver.rate >= least, "driver.rate", driver.rate, bound)
-        super().__init__(driver, shape)
-        whole = math.gcd(driver.block, driver.delay)
-        most = max(int(driver.rate / envelope_rate), 1)
-        self.hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
-        self.rate = driver.rate / self.hold
-        self.block, self.delay = driver.block // self.hold, driver.delay // self.hold
-        self._step, self._turns = frequency / driver.rate, 0.0  # turns a sample; phase of the next one
-        self._droop = float(np.sinc(self._step))  # of the carrier behind the device's hold
-
-    def play(self, drive: Array) -> Sensed:
-        """Play the carrier under `shape` of a block."""
-        count = len(drive) * self.hold
-        carrier = np.cos(2 * np.pi * (self._turns + self._step * np.arange(count))) / self._droop
-        self._turns = (self._turns + self._step * count) % 1.0
-        sensed = self.put(np.repeat(self.shape(drive), self.hold, axis=0) * carrier[:, None])
-        return thinned(sensed, self.hold)
+        whole, most = math.gcd(driver.block, driver.delay), max(int(driver.rate / envelope_rate), 1)
+        hold = max(each for each in range(1, min(whole, most) + 1) if whole % each == 0)
+        super().__init__(driver, root, hold, frequency / driver.rate)

@@ -6,7 +6,7 @@
  *   free ON   1: go through periods as fast as all clients can, until 0
  *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
  *   stall MS  sleep once inside a period: the server reports an overrun
- *   square N  square what comes in, as a carrier does, and add N (a load)
+ *   square N  square the last input, as a carrier does, and add N (a load)
  *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
  *   count     print periods, overruns that JACK reported, and the time of the server in frames
  *   save FILE write what was recorded: float32, outputs without noise, then with it, a row a sample
@@ -69,7 +69,8 @@ static int process(jack_nframes_t frames, void *unused) {
     for (int i = 0; i < outputs; i++) out[i] = jack_port_get_buffer(out_port[i], frames);
     for (jack_nframes_t n = 0; n < frames; n++) {
         double u[MOST], y[MOST];
-        for (int i = 0; i < inputs; i++) u[i] = load < 0.0 ? in[i][n] : in[i][n] * in[i][n] + load;
+        for (int i = 0; i < inputs; i++) u[i] = in[i][n];
+        if (load >= 0.0) u[inputs - 1] = u[inputs - 1] * u[inputs - 1] + load;
         sample(u, y);
         if (y[0] > above) gain = next_gain;
         for (int i = 0; i < outputs; i++) out[i][n] = (float)(gain * (y[i] + noise * gauss()));

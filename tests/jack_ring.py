@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import expm
+from scipy.linalg import block_diag, expm
 from synthetic import make_bands
 
 from hapticrender.control.methods import METHODS
 from hapticrender.drivers.audio import AudioDriver
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
 from hapticrender.plants.plate import PlateParameters, structure
+from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
@@ -29,6 +30,8 @@ CLIENT = "plate"
 RATE, BLOCK = 48_000.0, 64  # Hz, samples
 AMPERES, METRES = 3.0, 1e-3  # of full scale, out and in
 PEAK, FRICTION = 10e-3, 4.0  # A, N: the same of a screen
+FAST, SHORT = 192_000.0, 16  # Hz, samples: of a card that plays a carrier itself
+VOLTS, VIBRATION = 10.0, 10e-6  # V, m: full scales of a vibrating surface
 NOISE = 1e-6  # m rms, of a sensor
 ROUND_TRIP = 128  # samples: PortAudio and the plate each get what the other played in the period before
 FREQUENCY = np.array([40.0, 90, 140, 190, 240, 290, 340, 390])  # Hz
@@ -86,6 +89,21 @@ def screen(speed: float, load: float) -> tuple[System, float]:
     return System(phi[:3, :3], phi[:3, 3:], np.array([[0.0, 1, 0]]), np.zeros((1, 1))), load / attraction
 
 
+def hybrid(speed: float, load: float) -> tuple[System, float]:
+    """A `screen` on the `plate`, whose finger presses in the middle."""
+    friction, offset = screen(speed, load)
+    return System(*map(block_diag, plate(0.0), friction)), offset
+
+
+def vibrating(load: float) -> System:
+    """Ultrasonic plate under a resting load (N) at `FAST`, exact under held drive; in `VOLTS` and `VIBRATION`."""
+    mode = UltrasonicParameters(rate=FAST)
+    w0, damping = 2 * np.pi * float(mode.resonance(load)), float(mode.damping(load)) / mode.mass
+    a, b = np.array([[0.0, w0], [-w0, -damping]]), np.array([[0.0], [mode.force_constant / mode.mass / w0]])
+    phi = expm(np.block([[a, b * VOLTS / VIBRATION], [np.zeros((1, 3))]]) / FAST)
+    return System(phi[:2, :2], phi[:2, 2:], np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+
+
 def cable(delay: float = 0.0, taps: int = 33, gain: float = 1.0) -> System:
     """Output 1 on input 1, `delay` samples later than (taps - 1)/2: a windowed sinc, exact to 1e-4 below 0.3 rate."""
     n = np.arange(taps) - (taps - 1) / 2
@@ -138,7 +156,7 @@ def build(folder: Path) -> Path:
 
 
 @contextmanager
-def server(folder: Path, name: str = "test"):
+def server(folder: Path, name: str = "test", rate: float = RATE, block: int = BLOCK):
     """Run a server of its own that needs no privileges, as a process; every client of this process finds it.
 
     It waits 20 s for a client: PortAudio 19.6 ends the process by an assertion where it was disconnected.
@@ -147,7 +165,7 @@ def server(folder: Path, name: str = "test"):
     own = {"JACK_DEFAULT_SERVER": name, "JACK_NO_START_SERVER": "1", "JACK_NO_AUDIO_RESERVATION": "1"}
     before = {key: os.environ.get(key) for key in own}
     os.environ.update(own)
-    command = ["jackd", "-r", "-t", "20000", "-n", name, "-d", "dummy", "-r", f"{RATE:.0f}", "-p", str(BLOCK)]
+    command = ["jackd", "-r", "-t", "20000", "-n", name, "-d", "dummy", "-r", f"{rate:.0f}", "-p", str(block)]
     with (folder / "jackd.log").open("w") as log:
         process = subprocess.Popen(command, stdout=log, stderr=log)
     try:

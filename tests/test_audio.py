@@ -180,6 +180,12 @@ def test_a_profiles_delay_is_without_what_play_queues(identified):
     assert [each.delay for each in models] == [max(identified, 128) + driver.host_delay, max(identified, 128)]
 
 
+HYBRID = {
+    "kind": "hybrid",
+    "calibration": {"drive_per_full_scale": [2, 2, 0.02], "sensed_per_full_scale": [1e-3, 1e-3, 4], "delay": 128},
+}
+
+
 def test_block_and_rate_are_options_of_the_text():
     """The advice names them too, quoted for a shell: a delay is that of a block and a rate."""
     driver = open_driver("audio:usb?block=256&rate=44100&channels=3,4&latency=high&sensed_channels=1,&delay=300.5")
@@ -190,6 +196,10 @@ def test_block_and_rate_are_options_of_the_text():
         driver.check_calibrated()
     profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0})
     assert open_driver("audio:0?drive_per_full_scale=1.5", profile).drive_limit == 1.5
+    for text in ("", "&drive_per_full_scale=3,3,0.01"):
+        driver = open_driver(f"audio:0?channels=1,2,3&sensed_channels=1,2,3{text}", hr.DeviceProfile(**HYBRID))
+        np.testing.assert_allclose(driver.drive_scale, [1 / 3, 1 / 3, 100.0] if text else [0.5, 0.5, 50.0])
+        assert (driver.sensed_scale.tolist(), driver.drive_limit) == ([1e-3, 1e-3, 4.0], 0.01 if text else 0.02)
     assert str(open_driver("audio:0?block=64")) == "audio:0"
     assert open_driver("audio:0?channels=1").channels == (1,)
     for options, refused in (
@@ -200,6 +210,8 @@ def test_block_and_rate_are_options_of_the_text():
         ("latency=0.1,", r"latency=\(0.1,\): must be"),
         ("block=many", "block='many' must be a whole number >= 1"),
         ("channels=0", r"channels=0: must be different whole numbers >= 1"),
+        ("drive_per_full_scale=3,3,3", "drive_per_full_scale = .3, 3, 3.: must be a number, or a list of 2"),
+        ("drive_per_full_scale=3,0", r"drive_per_full_scale\[1\] = 0: must be a finite number > 0"),
     ):
         with pytest.raises(ValueError, match=refused):
             open_driver(f"audio:0?{options}")

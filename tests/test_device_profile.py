@@ -24,7 +24,7 @@ PLATE = {
     "uncertainty": {"mass": 1e-5},
     "calibration": {
         "drive_per_full_scale": 3.0,
-        "sensed_per_full_scale": 2e-4,
+        "sensed_per_full_scale": (2e-4, 2.1e-4),
         "delay": 5.25,
         "gain_uncertainty": 0.02,
     },

@@ -61,6 +61,8 @@ def test_a_driver_gets_what_it_names_of_its_profile_and_no_more():
         ({"sensed_per_full_scale": 5.0, "delay": 197.4}, {}, "sensed_per_full_scale = 5, delay = 197.4: OtherPlate"),
         ({"sensed_per_full_scale": 5.0}, {"sensed_per_full_scale": 4.0}, "sensed_per_full_scale = 5: OtherPlate"),
         ({"sensed_per_full_scale": 5.0, "delay": 1.4}, {"sensed_per_full_scale": 5.0}, ""),
+        ({"drive_per_full_scale": [3.0, 0.01]}, {}, "drive_per_full_scale = 3, 0.01: OtherPlate"),
+        ({"drive_per_full_scale": [3.0, 0.01]}, {"drive_per_full_scale": (3.0, 0.01)}, ""),
         ({"gain_uncertainty": 0.1}, {}, ""),
     ],
 )

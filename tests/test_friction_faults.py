@@ -10,8 +10,10 @@ from test_ultrasonic_rendering import watched
 
 import hapticrender as hr
 from hapticrender.control.supervisor_kernel import JUMP_NEIGHBOURS
+from hapticrender.jit import kernel, record
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
+from hapticrender.renderers import conversions
 
 START = 0.21  # s: when the sensor fails; one that falls to 0 from near it does not jump
 ZERO = 2e-3  # s from the stop to zero drive
@@ -125,6 +127,12 @@ def test_no_finger_makes_a_tribometer_jump(leak, block):
     assert not (recording.flags & hr.Flag.STOPPED).any()
 
 
+@kernel
+def jumped(state, values):
+    """Whether a vibration jumps in a block (m)."""
+    return conversions.jumps(record(state, conversions.RESONANT_T, 0), values, 0, len(values), False)
+
+
 def test_a_vibration_that_jumps_is_found_at_any_phase_and_a_healthy_one_never_jumps(rng):
     """In the block; 0.9 um in 2 nm of noise, which decays as under the finger that damps most, or does not, for 5 s.
 
@@ -136,19 +144,19 @@ def test_a_vibration_that_jumps_is_found_at_any_phase_and_a_healthy_one_never_ju
     ).driver
     mode = driver.parameters.mode
     worst = mode.damping() + 3.0 * (mode.damping(15.0) - mode.damping())
-    jumps = lambda values: driver._jumps(hr.Sensed(values[:, None]))  # noqa: E731
+    jumps = lambda values: jumped(driver.state.ctypes.data, values)  # noqa: E731
     assert not jumps(2e-9 * rng.standard_normal(100))  # at rest, before all else
     turns = 2 * np.pi * (mode.frequency - 60.0) / driver.driver.rate * np.arange(32)  # off by two half widths
     for phase in np.arange(0, 2 * np.pi, 0.1):
         steady = 0.9e-6 * np.cos(turns + phase) + 2e-9 * rng.standard_normal(32)
         for gain in (3.0, 1 / 3, -1.0):
-            driver._last[:] = np.nan
+            driver.state["before"] = driver.state["last"] = np.nan
             assert not jumps(steady[:16])
             assert jumps(gain * steady[16:])
     for damping in (0.0, float(worst)):
         decay = np.exp(-damping / (2 * mode.modal_mass * driver.driver.rate) * np.arange(32))
         for _ in range(30_000):
-            driver._last[:] = np.nan
+            driver.state["before"] = driver.state["last"] = np.nan
             values = 0.9e-6 * decay * np.cos(turns + rng.uniform(0, 6.3)) + 2e-9 * rng.standard_normal(32)
             assert not jumps(values)
 

@@ -1,16 +1,19 @@
 """What fails in live play on screens, ultrasonic surfaces and hybrids: the drive of the device itself is zero."""
 
 import copy
+from functools import partial
 from itertools import product
 
 import numpy as np
 import pytest
 from electroadhesive import Screen
-from live_devices import slide
+from live_devices import Bench, slide
+from strangers_resonator import Resonator
 from test_hybrid import bench
 from test_ultrasonic_rendering import watched
 
 import hapticrender as hr
+from hapticrender.live_loop import LiveLoop
 
 START = 0.2  # s: when it fails
 HANG = 0.1  # s
@@ -50,6 +53,55 @@ def test_a_screen_on_a_card_is_designed_for_the_delay_of_play():
         [band] = player.state().bands
         assert player._loop.model.delay == 4 * 26
     assert band.error < 0.05
+
+
+class Open(Bench):
+    """A device at the carrier's rate that senses nothing."""
+
+    rate, block, delay, drive_channels, sensed_channels, probe = 192e3, 64, 64, 1, 0, False
+
+    def __init__(self):
+        self.played = []
+
+    def play(self, drive):
+        self.played.append(drive.copy())
+        return hr.Sensed(np.zeros((self.block, 0)))
+
+
+VIBRATING = {
+    "a sample of friction a block": lambda: watched(FINGER),
+    "two": partial(Resonator, block=32),
+    "four, open loop": Open,
+}
+
+
+@pytest.mark.parametrize("name", VIBRATING)
+def test_a_callback_vibrates_a_surface_as_a_thread_does(name):
+    """To rounding, through a change of texture; a stop is zero at once in both."""
+    first, second = (
+        hr.Scene(device="ultrasonic", finger=FINGER, duration=10.0, texture=each)
+        for each in (hr.Grating(frequency=100.0, velocity=5e-3), TEXTURE)
+    )
+    with VIBRATING[name]() as own, VIBRATING[name]() as called:
+        thread = LiveLoop(hr.prepare(first, driver=own, compiled=False))
+        callback = LiveLoop(hr.prepare(first, driver=called, compiled=False), sensed_scale=1.0, drive_scale=1.0)
+        block, rate, played = thread.driver.block, thread.rate, [np.zeros((called.block, called.drive_channels))]
+        change, silence, end = (round(each * rate / block) for each in (0.05, 0.14, 0.15))
+        for n in range(end):
+            for loop in (thread, callback):
+                loop.finger(float(FINGER.position(np.array([n * block / rate]))[0]), 0.08, 0.4)
+                if n == change:
+                    new = hr.prepare(second, driver=loop.rendering.device, compiled=False)
+                    loop.replace(new, *loop.made(new))
+                if n == silence:
+                    loop.silence()
+            thread.advance(False)
+            played.append(callback.process(called.play(played[-1]).sensed))
+    found, expected = (np.concatenate(each[:silence]) for each in (played, own.played))
+    assert abs(expected).max() > 1.0
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
+    assert not played[-1].any()
+    assert not own.played[-1].any()
 
 
 def unplug(sensed):

@@ -26,6 +26,7 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
 from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
 from hapticrender.realtime_kernel import ENTRY, HOLD, HORIZON, JUMP, MIDDLE_AT, swap
+from hapticrender.renderers.shaped import Port, ShapedDriver
 from hapticrender.sampled_texture import AHEAD, FADE, FRESH, SampledTexture, publish
 
 RATE, BLOCK = 5000.0, 10
@@ -117,19 +118,19 @@ def test_the_drive_of_a_screen_is_the_peak_of_its_carrier(straight, rng):
     """By the square root that is before a driver; a larger bias is reached within `FADE`; at rest it fades to zero."""
     wanted = bands(wavenumber=500.0)
     roots = [SquareRoot(bias=bias, floor=bias / 20, gain=2e4, straight=straight) for bias in (0.4, 0.9, 0.2)]
-    entry, twin = (RealtimeEntry(friction_controller(wanted)) for _ in range(2))
-    entry.set_root(roots[0])
+    root = ShapedDriver(Port(RATE, BLOCK, BLOCK, 1, 2), roots[0])
+    entry, twin = (RealtimeEntry(friction_controller(wanted), converter=each) for each in (root, None))
     sensed, n = 1e-7 * rng.standard_normal((1000, 2)), round(FADE * RATE)
     for each in (entry, twin):
         each.finger(-0.01, 0.05)
     drive, _ = plain(twin, abs(sensed))
     assert abs(drive).max() > 0.0
     np.testing.assert_allclose(plain(entry, sensed[:500])[0], roots[0](drive[:500]), rtol=1e-12)
-    entry.set_root(roots[1])
+    root.reshape(roots[1])
     rising = plain(entry, sensed[500 : 500 + n])[0]
     assert (rising > roots[0](drive[500 : 500 + n])).all()
     assert (rising[: n // 3] < roots[1](drive[500 : 500 + n // 3])).all()
-    entry.set_root(roots[2])
+    root.reshape(roots[2])
     np.testing.assert_allclose(plain(entry, sensed[500 + n :])[0], roots[1](drive[500 + n :]), rtol=1e-12)
     entry.silence()
     fading, rest = np.split(plain(entry, sensed[:20])[0], [round(FADE_OUT * RATE)])
@@ -258,13 +259,15 @@ def test_textures_that_have_faded_out_are_let_go():
     assert abs(entry.log(9900)["reference"]).max() == pytest.approx(20e-6, rel=0.02)
 
 
-def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(rng):
-    """Floats of 2e-4 m at full scale in, 1.0 for 4 A out."""
-    entry, twin = RealtimeEntry(controller(), sensed_scale=2e-4, drive_scale=0.25), controller()
+@pytest.mark.parametrize("scales", [(2e-4, 0.25), ([2e-4, 3e-4], [0.25, 2.0])])
+def test_the_audio_callback_scales_full_scale_to_metres_and_amperes(scales, rng):
+    """Floats of 2e-4 m at full scale in, 1.0 for 4 A out; or of other units in every channel."""
+    units, drive_scale = np.array(scales[0]), np.array(scales[1])
+    entry, twin = RealtimeEntry(controller(), sensed_scale=scales[0], drive_scale=scales[1]), controller()
     floats = rng.standard_normal((400, 2)).astype(np.float32) * np.float32(0.01)
     given = np.full((400, 2), np.nan, np.float32)
     assert AUDIO(entry.address)(floats.ctypes.data, given.ctypes.data, 400, None, 0, entry.user_data) == 0
-    expected = 0.25 * twin.run(2e-4 * floats.astype(float), np.full(400, np.nan), np.zeros(400))[0]
+    expected = drive_scale * twin.run(units * floats.astype(float), np.full(400, np.nan), np.zeros(400))[0]
     np.testing.assert_array_equal(given, expected.astype(np.float32))
 
 

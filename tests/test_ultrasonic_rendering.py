@@ -225,6 +225,16 @@ def test_a_deviation_in_each_of_three_tries_is_refused(tries, shown, named):
         probe_resonance(Resonator(30e3, 200.0, 1.777, tell=tell), UltrasonicParameters())
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_probe_allows_for_what_play_adds_to_the_delay(stated):
+    """As on a sound card: samples that the delay of its callback is without; 50 are 292 degrees beside whole turns."""
+    device = Resonator(30e3, 200.0, 1.777, block=16, late=50)
+    if stated:
+        device.play_delay = 16 + 50
+    with nullcontext() if stated else pytest.raises(hr.DeviceFault, match="turned by"):
+        probe_resonance(device, UltrasonicParameters())
+
+
 def test_a_healthy_surface_at_another_carrier_and_rate_is_accepted():
     device = Resonator(60e3, 200.0, 3.554)
     device.rate = 400e3

@@ -32,10 +32,11 @@ def probe_resonance(driver: Driver, mode: Any) -> None:
     A `DeviceFault` where a deviation was found in each of three tries.
     """
     mode, fault = mode.sampled(driver.rate), ""
+    late = getattr(driver, "play_delay", driver.delay) - driver.block
     drive = resonance_drive(mode)
     for _ in range(TRIES):
         sensed, lost = play_probe(driver, drive[:, None], 1, REST)
-        fault = judge_resonance(mode, driver.delay - driver.block, drive, sensed[:, 0])
+        fault = judge_resonance(mode, late, drive, sensed[:, 0])
         if fault and lost > MOST_INVALID:
             fault = f"{lost:.0%} of the samples were lost on the way: the probe cannot judge"
         if not fault:

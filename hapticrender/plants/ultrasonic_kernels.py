@@ -53,6 +53,7 @@ SURFACE = np.dtype(
         ("friction_coefficient", "f8"),  # mu0, of the surface at rest
         ("bias", "f8"),  # mu/mu0 without drive
         ("least_ratio", "f8"),  # least mu/mu0 of the reference
+        ("least_speed", "f8"),  # m/s: a slower finger counts as one at this speed
         ("load", "f8"),  # N that the amplitude is held for while no finger is there
         ("speed", "f8"),  # m/s, alike
         ("slew", "f8"),  # m by which the drive can change a zero amplitude in a sample of the carrier
@@ -141,13 +142,17 @@ def within_reach(reached, reference, slew, decay):
 
 
 @kernel
-def references_within_reach(references, reached, slew, decay, result, flags):
-    """`within_reach` for every element of `references` (m), after `reached`; what is delayed is flagged."""
-    for n in range(references.shape[0]):
-        reached = within_reach(reached, references[n], slew, decay)
-        if reached != references[n]:
-            flags[n] |= SATURATED
-        result[n] = reached
+def sliding_reference(s, drive, load, speed):
+    """Reference (m) of the amplitude for a friction `drive` (N) under a finger (N, m/s; NaN while lifted).
+
+    Before it whole friction (N, 0 where no finger slides), load (N) and speed (m/s) for which it holds; then flags.
+    """
+    touching = not math.isnan(speed) and load > 0.0
+    whole = s.friction_coefficient * load if touching else 0.0
+    pace = max(abs(speed), s.least_speed) if touching else s.speed
+    ratio = s.bias + (drive / whole if touching and abs(drive) < HUGE else 0.0)
+    inside, load = min(max(ratio, s.least_ratio), 1.0), load if touching else s.load
+    return whole, load, pace, reference_amplitude(s.law, inside, load, pace), 0 if inside == ratio else SATURATED
 
 
 @kernel
@@ -188,12 +193,8 @@ def surface_step(state, signals, start, count):
     motion, flags = numba.carray(pointer(io.motion, F8), (end, 2)), numba.carray(pointer(io.flags, I8), end)
     for n in range(start, end):
         x = inputs[n]
-        load, speed, touching = x[LOAD], x[SPEED], not math.isnan(x[SPEED]) and x[LOAD] > 0.0
-        whole = s.friction_coefficient * load if touching else 0.0
-        pace = max(abs(speed), s.sliding.least_speed) if touching else s.speed
-        ratio = s.bias + (drive[n] / whole if touching and abs(drive[n]) < HUGE else 0.0)
-        inside = min(max(ratio, s.least_ratio), 1.0)
-        reference = reference_amplitude(s.law, inside, load if touching else s.load, pace)
+        speed = x[SPEED]
+        whole, load, pace, reference, delayed = sliding_reference(s, drive[n], x[LOAD], speed)
         amplitude, raised = amplitude_pass(s, reference, x, noise[n])
         steady = whole * friction_ratio(s.law, amplitude, load, pace)
         friction, reading = sliding_step(s.sliding, steady, speed, noise[n, 0])
@@ -202,6 +203,6 @@ def surface_step(state, signals, start, count):
             s.reading = whole * friction_ratio(s.law, math.hypot(re, im), load, pace)
         elif abs(reading) >= s.sliding.force_range:
             raised |= SENSOR_CLIPPED
-        sensed[n], flags[n] = reading, raised if inside == ratio else raised | SATURATED
+        sensed[n], flags[n] = reading, raised | delayed
         motion[n, FRICTION], motion[n, AMPLITUDE] = friction, amplitude
     return 0

@@ -13,6 +13,7 @@ from hapticrender.errors import naming
 from hapticrender.touch import toml_text
 
 ENDING = ".toml"  # of a device's name that is a file
+Scales = float | tuple[float, ...]
 HEAD = ("kind", "name", "measured_by", "measured_with", "measured_on", "probe")  # the table [profile] of a file
 
 
@@ -33,8 +34,12 @@ class Limits(Validated):
 class Calibration(Validated):
     """Numbers between a converter and SI units, and how sure the sensors' gain is; None: not measured."""
 
-    drive_per_full_scale: float | None = parameter(None, about="A or V at a sample of 1.0 played", above=0.0)
-    sensed_per_full_scale: float | None = parameter(None, about="m or N at a sample of 1.0 recorded", above=0.0)
+    drive_per_full_scale: Scales | None = checked(
+        checks.scales, None, about="A or V at a sample of 1.0 played, of all channels or a list, one each; > 0"
+    )
+    sensed_per_full_scale: Scales | None = checked(
+        checks.scales, None, about="m or N at a sample of 1.0 recorded, alike; > 0"
+    )
     delay: float | None = parameter(None, "samples", "from a sensed sample to the drive computed from it", above=0.0)
     gain_uncertainty: float = parameter(0.0, about="relative standard uncertainty of the sensors' gain", most=1.0)
 

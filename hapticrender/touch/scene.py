@@ -17,7 +17,7 @@ from hapticrender.errors import SceneError, naming
 from hapticrender.protocols import Texture
 from hapticrender.touch import toml_text
 from hapticrender.touch.composed import Chirp, Playlist, Sum
-from hapticrender.touch.device_profile import ENDING, DeviceProfile, table_of
+from hapticrender.touch.device_profile import ENDING, Calibration, DeviceProfile, table_of
 from hapticrender.touch.finger import Finger
 from hapticrender.touch.grating import Grating
 from hapticrender.touch.mechanics import NAMED
@@ -65,6 +65,10 @@ OWN = {  # keys of these tables that are fields of a scene: table, key, field
     **{("render", key): key for key in ("method", "tolerance", "settle", "keep_unfelt", "gradient")},
 }
 Value = float | int | str | bool
+
+
+def _calibration(name: str, values: Any) -> dict[str, Any]:
+    return table_of(Calibration.read(name, values))
 
 
 def _read_table(name: str, values: Any) -> dict[str, Value]:
@@ -127,7 +131,7 @@ class Scene(Validated):
     device: str = checked(checks.name, "vt-plate", about="name of a renderer, or file (.toml) of a `DeviceProfile`")
     profile: Mapping[str, Value] = mapping(_read_table, "parameters of the device that the controller is designed for")
     limits: Mapping[str, Value] = mapping(_read_table, "entries of `hapticrender.touch.device_profile.Limits`")
-    calibration: Mapping[str, Value] = mapping(_read_table, "entries of `Calibration` beside it")
+    calibration: Mapping[str, Value | tuple[float, ...]] = mapping(_calibration, "entries of `Calibration` beside it")
     source: str = checked(checks.text, "", about="which profile the parameters are from, by whom and when")
     simulation: Mapping[str, Value] = mapping(_read_table, "parameters in which a simulated device differs, its level")
     rendering: Mapping[str, Value] = mapping(_read_table, "settings of the renderer, such as ``crossover``")
