@@ -116,10 +116,9 @@ class RealtimeEntry(Addressed):
     ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
             raise TypeError(f"controller of type {type(controller).__name__}: must have a compiled step")
-        if converter is not None and not hasattr(converter, "conversion"):
-            raise TypeError(
-                f"converter of type {type(converter).__name__}: must have compiled steps, as a WrappedDriver"
-            )
+        if converter is not None and not any(getattr(converter, each, None) for each in ("act", "sense")):
+            bound = "must have compiled steps, `act` or `sense`, where the device calls back"
+            raise TypeError(f"converter of type {type(converter).__name__}: {bound}")
         self.controller = controller
         self.converter, self.rate = converter, float(controller.rate)
         rows, hold = (controller.block, 1) if converter is None else (converter.block, converter.hold)

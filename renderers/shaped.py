@@ -29,12 +29,12 @@ class Port:
 
 
 class WrappedDriver:
-    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`, by `put`.
+    """A driver whose drive or measurements are converted on the way; a subclass fills in `play`, by `put`, and steps.
 
-    Compiled steps do so: `act` makes `played` of the controller's drive, `sense` what the controller gets of `given`
-    (see `jit.CONVERSION`), from a `state`.  A `RealtimeEntry` takes the same steps where the device calls back.  A
-    sample of the controller is `hold` of the device.  While `resting` the device's own drive fades to zero: what zero
-    drive of the controller becomes may be a bias.
+    Compiled steps convert: `act` makes `played` of the controller's drive, `sense` what the controller gets of `given`
+    (see `jit.CONVERSION`), from a `state`.  A `RealtimeEntry` takes the same steps where the device calls back, and
+    refuses a driver that has none.  A sample of the controller is `hold` of the device.  While `resting` the device's
+    own drive fades to zero: what zero drive of the controller becomes may be a bias.
     """
 
     motion_source = "true"  # of the motion that `play` returns, where it does

@@ -185,8 +185,9 @@ def friction(device, **limits):
 @pytest.mark.parametrize(("name", "share"), [("peak_drive", 1.0), ("rms_drive", np.sqrt(0.5))])
 def test_a_screens_current_is_limited_by_the_peak_of_its_carrier(name, share):
     """The rms of a carrier is its peak over the root of 2; bias and swing together need most."""
-    shape = hr.prepare(friction("electroadhesion"), driver=Screen()).driver.shape
-    most = shape(np.array([[shape.bias - shape.floor]])).item()
+    driver = hr.prepare(friction("electroadhesion"), driver=Screen()).driver
+    bias, floor = (float(driver.state[name][0]) for name in ("bias", "floor"))
+    most = driver.convert(np.array([[bias - floor * bias]])).item()
     message = r"texture.amplitude asks for an attraction of .* N: must be <= .* A"
     refused_beyond(lambda value: friction("electroadhesion", **{name: value}), share * most, message)
 

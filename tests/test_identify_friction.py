@@ -59,7 +59,7 @@ def test_a_screens_gain_and_friction_are_found_under_a_sliding_finger(kind):
     assert found.profile() == pytest.approx({"friction_coefficient": 0.6, "open_loop_gain": 1.5e4}, rel=0.01)
     texture, finger = hr.Grating(frequency=100.0, amplitude=50e-6), hr.Finger.sliding(speed=0.08, normal_load=0.5)
     scene = hr.Scene(texture=texture, finger=finger, duration=0.1, device="electroadhesion", profile=found.profile())
-    assert hr.prepare(scene, driver=Screen()).driver.shape.gain == pytest.approx(1.5e4, rel=0.01)
+    assert hr.prepare(scene, driver=Screen()).driver.state["gain"] == pytest.approx(1.5e4, rel=0.01)
     assert set(found.uncertainty()) == set(found.profile())
 
 

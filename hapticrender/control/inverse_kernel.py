@@ -53,6 +53,7 @@ MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more t
 HUGE = 1e6  # drive unit: no drive
 NOISE_POLE = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
 MOST_NOISE = 25.0  # of the sensors' stated one, as mean squares
+FORCE = Y  # rows of a sample's forces, once its measurements have been read
 SCALED = 0.999  # a reference scaled by less is saturated
 
 
@@ -235,7 +236,7 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
     at = v.sample % (v.delay + 1)
     played0 = played1 = most = 0.0
     for i in range(c.p.channels):
-        exact = c.confidence * drive_of(c, samples, Y, 0, i)
+        exact = c.confidence * drive_of(c, samples, FORCE, 0, i)
         if not abs(exact) < HUGE:
             exact = 0.0
             flags[n] |= NONFINITE
@@ -280,7 +281,7 @@ def inverse_step(state, signals, start, count):
         learning = follow_contact(state, inverse)
         take_reference(state, inverse, waveform[n] if c.p.reads_waveform > 0.0 else 0.0)
         error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
-        samples[Y, 0] = samples[Y + 1, 0] = 0.0  # from here on forces: the damper's first
+        samples[FORCE, 0] = samples[FORCE + 1, 0] = 0.0  # the damper's, first
         if update_confidence(c, implausible):
             reset_parameters(inverse, FINGER, PARAMETERS)
         elif v.learns > 0:
@@ -292,7 +293,7 @@ def inverse_step(state, signals, start, count):
                 error = error0 if i == 0 else error1
                 if learning and implausible == 0:
                     learn(inverse, i, error)
-                samples[Y + i, 0] = damp(state, i, error)
+                samples[FORCE + i, 0] = damp(state, i, error)
         if v.sample % REVERSION == 0:
             revert(inverse)
         if v.sample % REFRESH == 0:
@@ -305,8 +306,8 @@ def inverse_step(state, signals, start, count):
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
         learned0, learned1 = learned_force(state, inverse)
         update_powers(inverse, nominal0, learned0)
-        samples[Y, 0] += nominal0 + learned0
-        samples[Y + 1, 0] += nominal1 + learned1 + levelling_force(inverse)
+        samples[FORCE, 0] += nominal0 + learned0
+        samples[FORCE + 1, 0] += nominal1 + learned1 + levelling_force(inverse)
         play(state, inverse, drive, flags, n, nominal0, nominal1)
         advance_regressors(state, inverse)
         v.sample += 1
