@@ -84,10 +84,11 @@ RESONANT = np.dtype(
         ("target", "c16"),  # m
         ("flags", "i8"),
         *((name, "f8") for name in ("reference", "goal")),  # state: amplitude (m) before a sample of friction and after
-        ("rises", "i8"),  # state: it starts from rest, where the loop's own ramp is slower
-        *((name, "f8") for name in ("whole", "touch_load", "pace", "friction")),  # state: of that sample (N, N, m/s, N)
+        ("starting", "i8"),  # state: it starts from rest, where the loop's own ramp is slower
+        # state, of that sample (N, N, m/s, N):
+        *((name, "f8") for name in ("sliding_friction", "touch_load", "touch_speed", "friction")),
         *((name, "i8") for name in ("samples", "jumped")),  # state: samples of the device; at which it jumped, or -1
-        *((name, "f8") for name in ("before", "last", "quiet")),  # state: the last two samples (m); sum of squares
+        *((name, "f8") for name in ("before", "last", "noise_sum")),  # state: the last two samples (m); sum of squares
         ("counted", "i8"),  # state: of so many differences
         ("peaks_at", "i8"),  # V: largest drives of the pieces that act, a ring
         *((name, "i8") for name in ("peaks", "peak")),  # their number; state: the next one
@@ -107,19 +108,19 @@ def jumps(r, given, start, count, lost):
     that for 1/3 is the bound.  Noise is what is stated, or the first `QUIET` samples show.  Nothing is compared where a
     converter holds its values, or samples were lost.
     """
-    quiet, found, bound = r.counted < QUIET, False, 0.0
-    if not quiet:
+    unknown, found, bound = r.counted < QUIET, False, 0.0
+    if not unknown:
         peaks = carray(pointer(r.peaks_at, F8), r.peaks)
-        bound = SIGMAS * max(r.stated, math.sqrt(r.quiet / r.counted)) + r.driven * peaks.max()
+        bound = SIGMAS * max(r.stated, math.sqrt(r.noise_sum / r.counted)) + r.driven * peaks.max()
     before, last = (math.nan, math.nan) if lost else (r.before, r.last)
     for n in range(start, start + count):
         y = given[n]
         change = abs(y - r.twice * last + before)
-        if not quiet:
+        if not unknown:
             size = math.sqrt(max(last * last + before * before - r.twice * last * before, 0.0)) / r.sine
             found |= y != last and last != before and change > bound + r.share * size
         elif change < HUGE:
-            r.quiet += change * change
+            r.noise_sum += change * change
             r.counted += 1
         before, last = last, y
     r.before, r.last = before, last
@@ -130,9 +131,9 @@ def jumps(r, given, start, count, lost):
 def approach(r, k, decay):
     """Take the reference on a straight line to sample k of one of friction, no faster than the drive can; flags."""
     line = r.reference + (r.goal - r.reference) * (k + 1) / r.hold
-    r.waveform = line if r.rises > 0 else within_reach(r.waveform, line, r.slew, decay)
+    r.waveform = line if r.starting > 0 else within_reach(r.waveform, line, r.slew, decay)
     if k == r.hold - 1:
-        r.reference, r.rises = r.goal, 0
+        r.reference, r.starting = r.goal, 0
     return SATURATED if r.waveform != line else 0
 
 
@@ -153,7 +154,8 @@ def advance(r, io, start, count, lost):
         row, k = n // r.hold, n % r.hold
         if k == 0:
             touch = finger[row]
-            r.whole, r.touch_load, r.pace, r.goal, raised = sliding_reference(r, drive[row], touch[0], touch[1])
+            found = sliding_reference(r, drive[row], touch[0], touch[1])
+            r.sliding_friction, r.touch_load, r.touch_speed, r.goal, raised = found
             flags[row] |= raised
             if r.sensors > 0:
                 sensed[row] = r.friction
@@ -165,7 +167,7 @@ def advance(r, io, start, count, lost):
         peak = max(peak, abs(played[n]))
         if k == r.hold - 1:
             re, im = observed_envelope(r.observed)
-            r.friction = r.whole * friction_ratio(r.law, math.hypot(re, im), r.touch_load, r.pace)
+            r.friction = r.sliding_friction * friction_ratio(r.law, math.hypot(re, im), r.touch_load, r.touch_speed)
     carray(pointer(r.peaks_at, F8), r.peaks)[r.peak] = peak
     r.peak = (r.peak + 1) % r.peaks
 

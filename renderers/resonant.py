@@ -96,7 +96,7 @@ class ResonantDriver(WrappedDriver):
             stated=math.sqrt(2 + twice**2) * (mode.sensor_noise + mode.sensor_step),
             driven=DRIVE_ERROR * mode.force_constant / mode.modal_mass * period**2,
             position=np.nan,
-            rises=1,
+            starting=1,
             jumped=-1,
             before=np.nan,
             last=np.nan,

@@ -239,25 +239,25 @@ def follow_contact(controller, inverse):
 def learn(inverse, coordinate, error):
     """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
     v = record(inverse, INVERSE_T, 0)
-    states, theta, covariance, gain = v.states, v.theta, v.covariance, v.inputs  # `inputs` as scratch
+    states, theta, covariance, p_psi = v.states, v.theta, v.covariance, v.inputs  # P psi in the scratch of `inputs`
     explained = states[coordinate, PARAMETERS]
     innovation = error - explained
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
     square = explained * explained + v.deviations * error * error + v.innovations * innovation * innovation
     v.model_power[coordinate] += v.mean_square_pole * (square - v.model_power[coordinate])
-    scatter = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
+    variance = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
     for i in range(PARAMETERS):
         found = 0.0
         for j in range(PARAMETERS):
             found += covariance[i, j] * states[coordinate, j]
-        gain[0, i] = found
-        scatter += found * states[coordinate, i]
+        p_psi[0, i] = found
+        variance += found * states[coordinate, i]
     for i in range(PARAMETERS):
-        share = gain[0, i] / scatter
-        theta[i] -= share * innovation
+        kalman_gain = p_psi[0, i] / variance
+        theta[i] -= kalman_gain * innovation
         for j in range(PARAMETERS):
-            covariance[i, j] -= share * gain[0, j]
+            covariance[i, j] -= kalman_gain * p_psi[0, j]
 
 
 @kernel
