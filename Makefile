@@ -15,7 +15,7 @@ OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
 # Tests that play in real time run first, one after the other; the rest on two cores.  test_audio_verbs paces its card.
-REAL_TIME := $(addprefix tests/test_,audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py)
+REAL_TIME := $(addprefix tests/test_,audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py)
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_profile.py board_textures.py \
 	nu32.py player_board.py)

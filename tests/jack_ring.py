@@ -38,6 +38,8 @@ FREQUENCY = np.array([40.0, 90, 140, 190, 240, 290, 340, 390])  # Hz
 AMPLITUDE = 2e-6  # m
 PACKAGES = "jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev"
 PATIENCE = 20.0  # s: until the server is there
+PERIODS = 1400  # of a freewheel, in which every period waits for all: 1.9 s; textures are computed 2 s ahead
+SETTLED = slice(round(1.2 * RATE), round(1.7 * RATE))  # of them
 
 
 def missing() -> str:
@@ -153,6 +155,14 @@ def build(folder: Path) -> Path:
     flags = "-std=gnu11 -O2 -Wall -Wextra -Werror".split()
     subprocess.run(["gcc", *flags, "-o", program, SOURCE, "-ljack"], check=True, timeout=120)
     return program
+
+
+def run_paced(device):
+    """Go through `PERIODS` of 2 ms in freewheel, and in it alone: in real time each of 1.3 ms would be late.
+
+    Returns the device's samples until its end.
+    """
+    return [device.say(each) for each in ("pace 2", f"run {PERIODS}", "pace 0")][1].periods * BLOCK
 
 
 @contextmanager
