@@ -49,7 +49,7 @@ class Pad(VibrotactileRenderer):
     name = "pad"
 
 
-def test_what_a_board_plays_is_asked_of_the_renderer(tmp_path):
+def test_a_renderer_names_the_law_of_boards_that_plays_its_device(tmp_path):
     """Not of its name; a rendering of no renderer of the library says what it lacks."""
     pad = hr.prepare(replace(SCENE, device="pad"), renderer=Pad())
     folders = tmp_path / "pad", tmp_path / "plate"

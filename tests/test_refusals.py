@@ -32,7 +32,7 @@ from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.realtime_entry import RealtimeEntry
-from hapticrender.renderers.shaped import Port
+from hapticrender.renderers.shaped import Port, WrappedDriver
 from hapticrender.sampled_texture import SampledTexture
 from hapticrender.sweep import sweep
 from hapticrender.touch.mechanics import LIGHT_SECOND, NONE
@@ -277,6 +277,10 @@ DRIVERS = [
     (lambda: protocol.encode(protocol.Frame(1, 0, bytes(250))), "payload of 250 bytes: must be <= 249"),
     (lambda: RealtimeEntry(object()), "controller of type object: must have a compiled step"),
     (lambda: RealtimeEntry(in_blocks(), converter=Port(1e3, 1, 1)), "converter of type Port: must have compiled steps"),
+    (
+        lambda: RealtimeEntry(in_blocks(), converter=WrappedDriver(Port(1e3, 1, 1))),
+        "converter of type WrappedDriver: must have compiled steps",
+    ),
     (lambda: RealtimeEntry(in_blocks(), frames=64), "frames = 64: must be a multiple of the controller's block of 25"),
     (lambda: entry().finger(0.0, np.nan), "must be finite"),
     (lambda: driver(rate=0.0), r"BaseDriver: rate=0.0 must be finite and > 0 Hz"),
