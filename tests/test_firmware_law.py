@@ -104,6 +104,7 @@ FAULTS = {
     "none": (0, lambda sensed: sensed),
     "not finite": (causes.INVALID, lambda sensed: np.nan * sensed),
     "every third": (causes.INVALID, lambda sensed: np.where(np.arange(len(sensed)) % 3, sensed, np.nan)),
+    "5 ms are lost": (0, lambda sensed: np.where(np.arange(len(sensed)) % 507 < 25, np.nan, sensed)),
     "frozen": (causes.FROZEN, lambda sensed: 0.0 * sensed + 1e-6),
     "inverted": (causes.INCONSISTENT, lambda sensed: -sensed),
     "swings far": (causes.OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),

@@ -97,13 +97,17 @@ def test_samples_of_which_some_are_numbers_stop_the_drive_as_if_none_were(every,
     assert max(plate.motion[first:]) < 1.01 * max(plate.motion[first - 1000 : first])  # four periods
 
 
+@pytest.mark.parametrize("frequency", [20.0, 100.0])
 @pytest.mark.parametrize(
-    ("period", "lost"), [(4, {0}), (500, {*range(25), 40})], ids=["every fourth", "a block, and a row soon after"]
+    ("period", "lost"), [(4, {0}), (507, {*range(25), 40})], ids=["every fourth", "a block, and a row soon after"]
 )
-def test_samples_that_are_lost_now_and_then_stop_nothing(period, lost):
-    """A quarter of all rows, which leave a mean of 0.25 of 0.3; 5 ms leave 1 - exp(-5/20) = 0.22."""
+def test_samples_that_are_lost_now_and_then_stop_nothing(period, lost, frequency):
+    """A quarter of all rows, which leave a mean of 0.25 of 0.3; 5 ms leave 1 - exp(-5/20) = 0.22.
+
+    507 samples are a seventh of a turn of 100 Hz more than ten: what is held meanwhile once had gains of -1.5 to 0.2.
+    """
     plate = Watched(lambda plate, sensed: np.nan * sensed if len(plate.played) % period in lost else sensed, **FINGER)
-    recording = hr.render(scene(20.0), driver=plate)
+    recording = hr.render(scene(frequency), driver=plate)
     assert np.isnan(recording.sensed[round(START * RATE) :, 0]).mean() == pytest.approx(len(lost) / period, abs=1e-3)
     assert not (recording.flags & hr.Flag.STOPPED).any()
 

@@ -176,11 +176,15 @@ static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t 
     }
 }
 
-/* Find the innovations and their mean squares; whether one has jumped. */
-static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const real_t sensed[])
+/* Find the innovations and their mean squares; whether one has jumped.  An invalid sample has none. */
+static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const real_t sensed[], uint32_t invalid)
 {
     uint32_t jump = 0u;
     for (uint32_t i = 0u; i < (uint32_t)LAW_SENSORS; i++) {
+        s->e[i] = REAL(0.0);
+        if ((invalid & (1u << i)) != 0u) {
+            continue;
+        }
         s->e[i] = p->scale * sensed[i] - model_sensor(s->models[STATE], p, i);
         const real_t square = s->e[i] * s->e[i];
         jump |= (square > JUMP * ((s->mean[i] > p->innovation) ? s->mean[i] : p->innovation)) ? 1u : 0u;
@@ -190,12 +194,13 @@ static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const rea
     return jump;
 }
 
-gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2])
+gain_faults_t gains_check(
+    gains_t *gains, const gain_settings_t *used, const real_t sensed[], uint32_t invalid, const real_t force[2])
 {
     gains_t *s = gains;
     const gain_settings_t *p = used;
     gain_faults_t faults = {0u, 0u, 0u};
-    const uint32_t jump = note_innovations(s, p, sensed);
+    const uint32_t jump = note_innovations(s, p, sensed, invalid);
     if ((jump != 0u) && (s->left == 0u)) {
         clear_sums(s, SENSOR);
         s->left = p->duration;

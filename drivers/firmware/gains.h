@@ -36,7 +36,9 @@ typedef struct {
     uint32_t sensors, actuators, swapped;
 } gain_faults_t;
 
-/* Compare a sample's sensors with the motion that device and force (N, N, from this sample on) give. */
-gain_faults_t gains_check(gains_t *gains, const gain_settings_t *used, const real_t sensed[], const real_t force[2]);
+/* Compare a sample's sensors, but those that are invalid (bits), with the motion that device and force (N, N, from this
+ * sample on) give. */
+gain_faults_t gains_check(
+    gains_t *gains, const gain_settings_t *used, const real_t sensed[], uint32_t invalid, const real_t force[2]);
 
 #endif

@@ -86,8 +86,9 @@ static supervisor_cause_t cause_of(
     return cause;
 }
 
-/* Convert a sample's sensors to coordinates, an invalid one held; tests 1, 2 and 8 against the sum of the drive. */
-static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], real_t drive)
+/* Convert a sample's sensors to coordinates, an invalid one (a bit of `which`) held; tests 1, 2 and 8 against the sum of
+ * the drive. */
+static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], real_t drive, uint32_t *which)
 {
     const design_t *d = s->design;
     uint32_t invalid = 0u;
@@ -112,6 +113,7 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
         s->input[0] += d->coordinate_from_sensor[0][i] * s->last[i];
         s->input[1] += d->coordinate_from_sensor[1][i] * s->last[i];
     }
+    *which = invalid;
     return cause_of(s, invalid, frozen, beyond, is_broken(s, lost));
 }
 
@@ -311,9 +313,9 @@ static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
 }
 
 /* Tests 9 to 11: whether a sensor or an actuator has changed its gain, or two are swapped. */
-static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause)
+static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t cause, uint32_t invalid)
 {
-    gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, s->force);
+    gain_faults_t found = gains_check(&s->gains, &s->p->gains, s->last, invalid, s->force);
     for (uint32_t i = 0u; i < LAW_SENSORS; i++) {
         if (2u * s->repeats[i] > s->p->frozen_time) { /* that is for test 2 to find */
             found.sensors &= ~(1u << i);
@@ -334,7 +336,8 @@ static supervisor_cause_t compare_gains(supervisor_t *s, supervisor_cause_t caus
 /* All tests of a sample; returns what failed first. */
 static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed[], const real_t drive[])
 {
-    supervisor_cause_t cause = check_sensors(s, sensed, s->forces[s->at][2]);
+    uint32_t invalid = 0u;
+    supervisor_cause_t cause = check_sensors(s, sensed, s->forces[s->at][2], &invalid);
     if ((check_drive(s, drive) != 0u) && (cause == SUPERVISOR_FINE)) {
         cause = SUPERVISOR_DRIVE;
     }
@@ -357,7 +360,7 @@ static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed
         cause = SUPERVISOR_RINGING;
     }
     if ((s->p->compared != 0u) && (s->cause == SUPERVISOR_FINE)) {
-        cause = compare_gains(s, cause);
+        cause = compare_gains(s, cause, invalid);
     }
     return cause;
 }

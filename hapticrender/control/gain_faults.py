@@ -224,11 +224,14 @@ def follow_actuators(s, force0, force1):
 
 
 @kernel
-def note_innovations(s, sensed, sensors):
-    """Find the innovations and their mean squares; whether one has jumped."""
+def note_innovations(s, sensed, sensors, invalid):
+    """Find the innovations and their mean squares; whether one has jumped.  An `invalid` sample (a bit) has none."""
     jump, energy = False, 0.0
     known0, known1 = model_sensors(s, STATE)
     for i in range(sensors):
+        s.e[i] = 0.0
+        if invalid & 1 << i:
+            continue
         s.e[i] = s.scale * sensed[i] - (known0 if i == 0 else known1)
         square = s.e[i] * s.e[i]
         jump |= square > JUMP * max(s.innovation, s.mean[i])
@@ -239,15 +242,15 @@ def note_innovations(s, sensed, sensors):
 
 
 @kernel
-def check_gains(gains, sensed, sensors, force0, force1):
+def check_gains(gains, sensed, sensors, invalid, force0, force1):
     """Sensors and actuators whose gain has changed, as bits, and whether two are swapped.
 
-    `force0` and `force1` (N) act from this sample on.
+    `invalid` has the sensors whose sample is none, as bits; `force0` and `force1` (N) act from this sample on.
     """
     s = record(gains, GAINS_T, 0)
     sensor_faults = actuator_faults = 0
     sensors_swapped = actuators_swapped = False
-    if note_innovations(s, sensed, sensors) and s.left == 0:
+    if note_innovations(s, sensed, sensors, invalid) and s.left == 0:
         clear_sums(s, SENSOR)
         s.left, s.energy[SENSOR] = s.duration, 0.0
         for i in range(6):

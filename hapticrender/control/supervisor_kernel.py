@@ -154,7 +154,7 @@ def is_broken(supervisor, lost):
 def check_sensors(supervisor, sensed, n, drive, acts):
     """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
 
-    A drive that does not act (on a surface without a sliding finger) moves no sensor.
+    Returns the cause, and the sensors that are invalid, as bits.  A drive that does not act (on a surface without a sliding finger) moves no sensor.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
     p, cause, invalid, frozen, beyond, lost = s.p, 0, 0, 0, 0, False
@@ -191,7 +191,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         cause = BEYOND
     if cause > 0 and s.cause == 0:
         s.sensors = invalid if cause == INVALID else frozen if cause == FROZEN else beyond
-    return cause
+    return cause, invalid
 
 
 @kernel
@@ -284,14 +284,14 @@ def check_motion(supervisor):
 
 
 @kernel
-def compare_gains(supervisor):
+def compare_gains(supervisor, invalid):
     """Tests 9 to 11; returns the cause, and the sensors or actuators, as bits."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, q = s.p, s.input
     if s.compared == 0:  # a steady load is no motion
         k = p.stiffness
         start_gains(p.gains, q[0], q[1], k[0, 0] * q[0] + k[0, 1] * q[1], k[1, 0] * q[0] + k[1, 1] * q[1])
-    sensors, actuators, swapped = check_gains(p.gains, s.last, p.sensors, s.force[0], s.force[1])
+    sensors, actuators, swapped = check_gains(p.gains, s.last, p.sensors, invalid, s.force[0], s.force[1])
     if sensors == 0 and actuators == 0 and not swapped:
         return 0, 0
     for i in range(p.sensors):
@@ -379,7 +379,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
     acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
     s.position = position[n]
-    cause = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
+    cause, invalid = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
     if p.least_friction > 0.0 and check_jump(supervisor, position[n] == position[n]) and cause == 0:
@@ -393,7 +393,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
         if p.gains != 0 and s.cause == 0:
-            found, which = compare_gains(supervisor)
+            found, which = compare_gains(supervisor, invalid)
             if found > 0 and cause == 0:
                 cause, s.sensors = found, which
         s.compared = 1
