@@ -241,18 +241,19 @@ def entry_for(live):
     return entry
 
 
-def relative_errors(device, path, entry, seconds=2.0, before=0.1):
+def relative_errors(device, path, entry, seconds=2.0, before=0.5):
     """Motion of centre and ends over the target, less 1, complex of shape (3, 8), `before` (s) the end of the record.
 
-    The last block that the entry sensed is found in what the device has recorded with its noise, and so are the entry's
-    own numbers of the device's samples.
+    A block that the entry sensed then is found in what the device has recorded with its noise, and so are the entry's
+    own numbers of the device's samples: what is lost later, after the freewheel, shifts nothing.
     """
     true, noisy = device.recorded(path)
-    samples = entry.samples
-    last = (entry.log(samples - BLOCK)["sensed"] / METRES).astype(np.float32)
-    (place,) = (n for n in np.flatnonzero(noisy[: -BLOCK + 1, 0] == last[0, 0]) if (noisy[n : n + BLOCK] == last).all())
-    index = np.arange(round(seconds * RATE)) + place - round((before + seconds) * RATE)
-    phase = 2 * np.pi * np.outer(index - place + samples - BLOCK, FREQUENCY) / RATE + comb().phase
+    start = entry.samples - round(before * RATE)
+    block = (entry.log(start)["sensed"][:BLOCK] / METRES).astype(np.float32)
+    starts = np.flatnonzero(noisy[: -BLOCK + 1, 0] == block[0, 0])
+    (place,) = (n for n in starts if (noisy[n : n + BLOCK] == block).all())
+    index = place - np.arange(round(seconds * RATE))
+    phase = 2 * np.pi * np.outer(index - place + start, FREQUENCY) / RATE + comb().phase
     motion = np.column_stack([true.mean(axis=1), true])[index].astype(float) * METRES
     found = np.linalg.lstsq(np.hstack([np.cos(phase), -np.sin(phase)]), motion, rcond=None)[0]
     return (found[:8] + 1j * found[8:]).T / comb().envelope - 1
