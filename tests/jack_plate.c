@@ -7,7 +7,8 @@
  *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
  *   stall MS  sleep once inside a period: the server reports an overrun
  *   square N  square the last input, as a carrier does, and add N (a load)
- *   gain G Y  multiply what is sensed, once the first output is above Y, but not what is recorded as the truth
+ *   gain G Y N  multiply what is sensed, once N more periods are over and the first output is above Y, but not what is
+ *             recorded as the truth
  *   count     print periods, overruns that JACK reported, and the time of the server in frames
  *   save FILE write what was recorded: float32, outputs without noise, then with it, a row a sample
  * The end of standard input ends it.
@@ -24,7 +25,7 @@
 enum { MOST = 64 };
 
 static int states, inputs, outputs;
-static long length, recorded;
+static long length, recorded, healthy;
 static double noise, load = -1.0, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
 static float *record;
 static jack_client_t *client;
@@ -72,7 +73,7 @@ static int process(jack_nframes_t frames, void *unused) {
         for (int i = 0; i < inputs; i++) u[i] = in[i][n];
         if (load >= 0.0) u[inputs - 1] = u[inputs - 1] * u[inputs - 1] + load;
         sample(u, y);
-        if (y[0] > above) gain = next_gain;
+        if (periods >= healthy && y[0] > above) gain = next_gain;
         for (int i = 0; i < outputs; i++) out[i][n] = (float)(gain * (y[i] + noise * gauss()));
         if (recorded < length) {
             for (int i = 0; i < outputs; i++) {
@@ -129,9 +130,13 @@ static void run(long count) {
 
 static void obey(char *line) {
     long number = 0;
+    double factor, level;
     char name[4096];
     sscanf(line, "square %lf", &load);
-    sscanf(line, "gain %lf %lf", &next_gain, &above);
+    if (sscanf(line, "gain %lf %lf %ld", &factor, &level, &number) == 3) {
+        healthy = atomic_load(&periods) + number;
+        next_gain = factor, above = level;
+    }
     if (sscanf(line, "run %ld", &number) == 1) run(number);
     if (sscanf(line, "free %ld", &number) == 1) jack_set_freewheel(client, (int)number);
     if (sscanf(line, "pace %ld", &number) == 1) atomic_store(&pace, number);
