@@ -242,4 +242,7 @@ sqrt, nearest, magnitude = (_of_one(REAL, _of_llvm(name)) for name in ("sqrt", "
 total = _of_one(types.float64, _total)  # sum over the lanes
 some = _of_one(types.boolean, lambda builder, mask, _: builder.icmp_unsigned("!=", builder.bitcast(mask, BITS), NONE))
 pair = _of_two(COMPLEX, lambda builder, real, imag: _value(builder, COMPLEX, real, imag))
-minimum, maximum = (_of_two(REAL, _of_llvm(name)) for name in ("minnum", "maxnum"))
+minimum, maximum = (  # the second where one is NaN
+    _of_two(REAL, lambda builder, x, y, sign=sign: builder.select(builder.fcmp_ordered(sign, x, y), x, y))
+    for sign in "<>"
+)

@@ -186,16 +186,16 @@ def advance_carriers(c):
 
 
 @kernel
-def update_targets(c, io, first):
+def update_targets(c, io, first, block):
     """Targets, references R and their slopes for a block, and a row of the log.
 
     A target is the setpoint times its weight, or follows the envelope that the waveform was found to have, at the
     observer's pace; both differentiated for a texture in velocity.
     """
     p = c.p
-    rate, row, crowded_gain = p.rate / p.block, first // p.block, crowding(c) if p.block == 1 else 1.0
-    follow = min(0.5 * crowded_gain * p.waveform_gain * p.block, 1.0)
-    factor = samples_of(c)[WAVEFORM, p.block - 1] if p.modulated > 0.0 else 1.0
+    rate, row, crowded_gain = p.rate / block, first // block, crowding(c) if block == 1 else 1.0
+    follow = min(0.5 * crowded_gain * p.waveform_gain * block, 1.0)
+    factor = samples_of(c)[WAVEFORM, block - 1] if p.modulated > 0.0 else 1.0
     log = carray(pointer(io.target, C16), (row + 1, c.bands))
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)

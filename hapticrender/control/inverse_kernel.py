@@ -269,13 +269,13 @@ def inverse_step(state, signals, start, count):
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
-        implausible = sense_block(c, io, n)
+        implausible = sense_block(c, io, n, 1)
         if c.locked == 0:
             track_finger(c, position[n])
         y0, y1 = samples[Y, 0], samples[Y + 1, 0]
         if c.bands > 0:
             advance_carriers(c)
-            update_targets(c, io, n)
+            update_targets(c, io, n, 1)
         else:
             c.sample += 1
         learning = follow_contact(state, inverse)

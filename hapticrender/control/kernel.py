@@ -52,13 +52,13 @@ CONFIDENCE_FADE = 0.02  # s: within this the drive fades out while a sensor's sa
 
 
 @kernel
-def sense_block(c, io, first):
+def sense_block(c, io, first, block):
     """Convert the block's sensors to coordinates; returns 1 where a sensor's sample is invalid.
 
     That is one that is not finite, or not inside the sensor's range: its coordinates are NaN, and the innovation takes
     the prediction in their place.  It is flagged, as a position or a waveform that is no number is.
     """
-    samples, p, block = samples_of(c), c.p, c.p.block
+    samples, p = samples_of(c), c.p
     sensed, flags = pointer(io.sensed, F8), pointer(io.flags, I8)
     position, waveform = pointer(io.position, F8), pointer(io.waveform, F8)
     reads, implausible = p.reads_waveform > 0.0 or p.modulated > 0.0, 0
@@ -194,13 +194,13 @@ def innovate_block(c):
 
 
 @kernel
-def update_envelopes(c, integral):
+def update_envelopes(c, integral, block):
     """Update error envelopes, integral parts and slopes of the commands of all bands, and run the detectors.
 
     Returns whether demodulated deviations exceed the levels of the two detectors in any band.  Sample by sample the
     deviation itself is demodulated; in blocks it is E - v and what the innovations add to it.
     """
-    p, samples, period, back = c.p, samples_of(c), c.p.block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
+    p, samples, period, back = c.p, samples_of(c), block / c.p.rate, c.p.back_calculation * (1.0 - c.scale)
     over, above = zeros(), zeros()
     for t in range(c.tiles):
         b = record(c.tiles_at, TILE_T, t)
@@ -209,23 +209,24 @@ def update_envelopes(c, integral):
         for i in range(p.coordinates):
             x = record(coordinates_of(c, t), COORDINATE_T, i)
             e, v = get(x, "e"), get(x, "v")
-            if p.block > 1:
+            if block > 1:
                 found = get(record(c.work_at, WORK_T, 2 * t + i), "x")
-                deviation = e - v + (2.0 / p.block) * found
+                deviation = e - v + (2.0 / block) * found
             else:
                 found, deviation = samples[Y + i, 0] * carrier, 2.0 * c.deviation[i] * carrier
             if p.detects > 0.0:
                 fast, slow = get(x, "fast"), get(x, "slow")
                 fast = fast + p.fast_pole * (deviation - fast)
                 slow = slow + p.slow_pole * (fast - slow)
-                over, above = maximum(over, square(fast)), maximum(above, square(slow))
+                over, above = maximum(square(fast), over), maximum(square(slow), above)
                 put(x, "fast", fast)
                 put(x, "slow", slow)
             e = (1.0 - period * fading) * e + gain * found
-            slope = -1.0 * (integral * e + fading * v)
+            pull = slope = -integral * e - fading * v
             put(x, "e", e)
-            # back-calculation is no part of dV/dt: else law and limiter would form an algebraic loop
-            put(x, "v", v + period * (slope - back * (v + p.pattern[i] * reference)))
+            if back > 0.0:  # no part of dV/dt: else law and limiter would form an algebraic loop
+                pull = slope - back * (v + p.pattern[i] * reference)
+            put(x, "v", v + period * pull)
             put(x, "slope", slope + p.pattern[i] * rise)
     return some(over > p.fast_threshold), some(above > p.slow_threshold)
 
@@ -253,7 +254,7 @@ def synthesise_block(c):
         if quadrature == 0:
             for m in range(c.p.block):
                 samples[Y, m], samples[Y + 1, m] = samples[SUM, m], samples[SUM + 1, m]
-        peak = max(peak, largest_drive(c, samples, quadrature > 0))
+        peak = max(peak, largest_drive(c, samples, quadrature > 0, c.p.block))
     for t in range(c.tiles):
         for i in range(c.p.coordinates):
             x = record(coordinates_of(c, t), COORDINATE_T, i)
@@ -279,10 +280,10 @@ def reset_loop(c):
 
 
 @kernel
-def begin(c, io, first):
+def begin(c, io, first, block):
     """Sensors and carriers of a block, and the gains of the observer and of the DC estimate."""
-    p, block = c.p, c.p.block
-    c.implausible = sense_block(c, io, first)
+    p = c.p
+    c.implausible = sense_block(c, io, first, block)
     if p.lock > 0.0 and (block > 1 or c.sample % REFRESH == 0):
         follow_resonance(c)
     advance_carriers(c)
@@ -315,15 +316,15 @@ def find_contact(c, adapt_now):
 
 
 @kernel
-def close_block(c, touching, adapt_now):
+def close_block(c, touching, adapt_now, block):
     """Envelopes from the innovations, adaptation, law, and the gain schedule.
 
     A detector over its level raises the gains for a while; then they fall slowly.
     """
-    p, block = c.p, c.p.block
+    p = c.p
     integral = p.integral + c.slow_open * (p.integral_medium - p.integral)
     integral = (integral + c.fast_open * (p.integral_high - integral)) * (1.0 - c.feedback_off)
-    fast, slow = update_envelopes(c, integral)
+    fast, slow = update_envelopes(c, integral, block)
     if update_confidence(c, c.implausible):
         reset_loop(c)
     if touching and adapt_now:
@@ -350,17 +351,17 @@ def error_step(state, signals, start, count):
     samples, stop = samples_of(c), start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
-        begin(c, io, n)
+        begin(c, io, n, 1)
         if c.p.reads_waveform > 0.0:
             analyse_sample(c)
-        update_targets(c, io, n)
+        update_targets(c, io, n, 1)
         adapt_now = c.sample % ADAPTATION_SAMPLES == 0
         touching = find_contact(c, adapt_now)
         innovate_sample(c)
-        close_block(c, touching, adapt_now)
+        close_block(c, touching, adapt_now, 1)
         apply_law(c)
-        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(c, samples, True))
-        limit_drive(c, samples, peak, drive, flags, n)
+        peak = max(c.p.peak_decay * c.p.peak_decay * c.peak_squared, largest_drive(c, samples, True, 1))
+        limit_drive(c, samples, peak, drive, flags, n, 1)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             flags[n] |= UNLOCKED
     return 0
@@ -373,19 +374,19 @@ def block_step(state, signals, start, count):
     samples, block, stop = samples_of(c), c.p.block, start + count
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     for first in range(start, stop, block):
-        begin(c, io, first)
+        begin(c, io, first, block)
         if c.stale > 0 or c.locked > 0 or c.gain != c.response_gain:
             turn_tables(c)
             invert(c, c.gain)
         if c.p.reads_waveform > 0.0:
             analyse_block(c)
-        update_targets(c, io, first)
+        update_targets(c, io, first, block)
         touching = find_contact(c, True)
         innovate_block(c)
-        close_block(c, touching, True)
+        close_block(c, touching, True, block)
         apply_law(c)
         peak = synthesise_block(c)
-        limit_drive(c, samples, peak, drive, flags, first)
+        limit_drive(c, samples, peak, drive, flags, first, block)
         if c.p.lock > 0.0 and c.unlocked > 0.0:
             for m in range(block):
                 flags[first + m] |= UNLOCKED

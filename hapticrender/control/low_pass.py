@@ -202,7 +202,7 @@ def low_pass_step(state, signals, start, count):
     drive, flags = carray(pointer(io.drive, F8), (stop, p.channels)), carray(pointer(io.flags, I8), stop)
     for n in range(start, stop):
         seen, held = c.finger_seen, c.held_position
-        implausible = sense_block(c, io, n)
+        implausible = sense_block(c, io, n, 1)
         if implausible > 0:  # these methods predict nothing
             samples[Y, 0], samples[Y + 1, 0] = 0.0, 0.0
         if c.locked > 0:
@@ -211,7 +211,7 @@ def low_pass_step(state, signals, start, count):
         advance_carriers(c)
         if p.reads_waveform > 0.0:
             analyse_sample(c)
-        update_targets(c, io, n)
+        update_targets(c, io, n, 1)
         if update_confidence(c, implausible):
             reset_loops(c)
         if p.polar > 0.0:

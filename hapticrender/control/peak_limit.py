@@ -29,11 +29,11 @@ def drive_of(c, samples, row, m, i):
 
 
 @kernel
-def largest_drive(c, samples, with_quadrature):
+def largest_drive(c, samples, with_quadrature, block):
     """Largest drive of a block over its limit, squared: of the samples, or of the analytic signal's envelope."""
     peak, scale = 0.0, c.confidence / c.p.drive_limit
     for i in range(c.p.channels):
-        for m in range(c.p.block):
+        for m in range(block):
             along = drive_of(c, samples, Y, m, i)
             across = drive_of(c, samples, SUM, m, i) if with_quadrature else 0.0
             peak = max(peak, along * along + across * across)
@@ -41,9 +41,9 @@ def largest_drive(c, samples, with_quadrature):
 
 
 @kernel
-def limit_drive(c, samples, peak, drive, flags, first):
+def limit_drive(c, samples, peak, drive, flags, first, block):
     """Scale the whole envelope into the limit, round, and write the drive of a block."""
-    confidence, limit, block = c.confidence, c.p.drive_limit, c.p.block
+    confidence, limit = c.confidence, c.p.drive_limit
     before, after = c.scale, 1.0 / math.sqrt(peak) if peak > 1.0 else 1.0
     c.peak_squared, c.scale = peak, after
     for m in range(block):

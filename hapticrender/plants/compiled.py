@@ -1,6 +1,5 @@
 """A plant with a compiled step: samples, noise and finger in, what is sensed and moved out, alone or in closed loop."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ HUGE = 1e300  # a drive beyond it is no number
 def quantise(value, step, limit):
     """Round to the nearest step inside +-`limit`; a step of 0 leaves the resolution ideal."""
     value = min(max(value, -limit), limit)
-    return step * math.floor(value * (1.0 / step) + 0.5) if step > 0.0 else value
+    return step * np.floor(value * (1.0 / step) + 0.5) if step > 0.0 else value
 
 
 def resolution(bits: str, span: str, times: float, about: str) -> Any:
@@ -128,7 +127,8 @@ class CompiledPlant:
         waveform = np.ascontiguousarray(waveform, float)  # a name keeps a copy alive while its address is used
         length, block = len(waveform), self.block
         n = -(-length // block) * block  # whole blocks; what is beyond the end is played and not returned
-        waveform = np.append(waveform, np.zeros(n - length))
+        if n > length:
+            waveform = np.append(waveform, np.zeros(n - length))
         signals = self._signals(n)
         drive = np.zeros((n + block, self.drive_channels))
         drive[:block] = self._last

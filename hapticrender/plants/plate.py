@@ -288,10 +288,8 @@ class Plate(CompiledPlant):
         return s
 
     def inputs(self, first: int, n: int) -> Array:
-        """Position (m), load (N) and strength of the finger, and a column that the plate does not use."""
-        inputs = np.zeros((n, 4))
-        inputs[:, :3] = self.finger.touch((first + np.arange(n)) / self.rate)
-        return inputs
+        """Position (m), load (N) and strength of the finger; the plate does not use its speed."""
+        return self.finger.touch((first + np.arange(n)) / self.rate)
 
     def noise(self, n: int) -> Array:
         """Draw the noise of both sensors; nothing is drawn where they have none."""
