@@ -22,7 +22,7 @@ from hapticrender.renderers.shaped import WrappedDriver, thinned
 from hapticrender.touch.finger import Finger
 
 DRIVE_ERROR = 2.0  # of the force that the drive may make, over that assumed
-LONGEST_DELAY = 0.25e-3  # s: a tenth of a turn of 400 Hz, 3 % off there, and beyond 10 % at half as much again
+LONGEST_DELAY = 0.25e-3  # s: none longer has been tried
 
 
 class ResonantDriver(WrappedDriver):
@@ -36,11 +36,11 @@ class ResonantDriver(WrappedDriver):
 
     Notes
     -----
-    `delay` is the block alone: the amplitude loop foresees a target over the device's own delay, by its slope.  Behind
-    1, 16 and 32 samples at 192 kHz 200 Hz come 0.95, 0.95 and 1.07 samples of friction late, and 0.2 % too small, 1.8 %
-    and 7 % too large.  That loop (`loop`) and its resonance lock step with every sample of the device, however long its
-    blocks are.  The finger estimate takes the delay d for a finger: a texture of f Hz is up to 1 % off at f d = 1/15
-    and 7 % at 1/10.
+    `delay` is the block and the whole samples of friction in the device's own delay, `lag` (s) what is left of that:
+    the amplitude follows its target that much later, and the friction's controller is to foresee it.  Behind 1, 16 and
+    48 samples at 192 kHz 200 and 400 Hz come 1.0, 2.0 and 3.9 samples of friction late, and within 0.3 % as large as
+    wanted.  The amplitude's loop (`loop`) and its resonance lock step with every sample of the device, however long its
+    blocks are.
     """
 
     sense = resonant_sense
@@ -59,8 +59,9 @@ class ResonantDriver(WrappedDriver):
         mode = replace(parameters.mode, delay=driver.delay)
         self.parameters = replace(parameters, level="carrier", oversampling=many, mode=mode)
         self.rate = float(parameters.rate)
-        self.delay = self.block
-        self.loop = amplitude_loop(self.parameters, held=None if driver.sensed_channels else nominal[0])
+        self.delay = self.block + driver.delay // many
+        self.lag = driver.delay % many / driver.rate
+        self.loop = amplitude_loop(self.parameters, held=None if driver.sensed_channels else nominal[0], late=True)
         model = replace(self.parameters.amplitude_model(), demand=demand)
         self._supervised: Any = supervised(self.loop, model) if driver.sensed_channels else self.loop
         self._samples = 0
@@ -166,12 +167,13 @@ def _multiple(driver: Driver, parameters: SurfaceParameters) -> int:
     return many
 
 
-def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None) -> BankController:
+def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None, late: bool = False) -> BankController:
     """Return the amplitude's own controller, of the default method, at rest.
 
-    `held` is the finger's load (N) on the mode where nothing is sensed; None: there is feedback.
+    `held` is the finger's load (N) on the mode where nothing is sensed; None: there is feedback.  Of a `late` one the
+    amplitude follows after the drive's delay, however high the gains are; else it depends on them.
     """
-    model, mode = parameters.amplitude_model(), parameters.carrier_mode
+    model, mode = replace(parameters.amplitude_model(), late=late), parameters.carrier_mode
     if held is not None:
         stiffness = mode.mass * (2 * np.pi * float(mode.resonance(held))) ** 2
         model = replace(model, damping=np.array([[float(mode.damping(held))]]), stiffness=np.array([[stiffness]]))

@@ -114,7 +114,8 @@ def adapt_finger(c, observer, damper):
     sum_k, sum_m, sum_b, weights = zeros(), zeros(), zeros(), zeros()
     for t in range(c.tiles):
         b, motion = record(c.tiles_at, TILE_T, t), pair(zeros(), zeros())
-        reference = interpolated(get(b, "filtered_r"), get(b, "r") - behind * get(b, "slope"), pole)
+        reference = get(b, "expected") if p.block == 1 else get(b, "r")
+        reference = interpolated(get(b, "filtered_r"), reference - behind * get(b, "slope"), pole)
         sweep, complete = get(b, "sweep"), get(b, "complete")
         w = get(b, "omega") - behind * sweep
         whole = where(get(b, "fade") >= 1.0, get(b, "feedback"), 0.0) >= 1.0

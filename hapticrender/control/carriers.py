@@ -7,7 +7,7 @@ from the finger's position in every sample.  With M samples a block the carrier 
 
 from numba import carray
 
-from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, TILE_T, WAVEFORM, W, samples_of
+from hapticrender.control.records import CONTROLLER_T, FADING, FIXED, LOCKED, PAIR_T, TILE_T, WAVEFORM, W, samples_of
 from hapticrender.jit import C16, entry, kernel, pointer, record
 from hapticrender.mathx import TURN, smooth, unit
 from hapticrender.vectors import (
@@ -209,7 +209,11 @@ def update_targets(c, io, first, block):
             put(b, "target", target)
             last, reference = get(b, "r"), get(b, "response") * target
             put(b, "slope", rate * (reference - last))
-            put(b, "expected", last + p.middle * (reference - last))
+            put(b, "expected", reference - (1.0 - p.middle) * (reference - last))
+            if p.late > 0:
+                kept = record(c.references_at, PAIR_T, c.sample % p.late * c.tiles + t)
+                put(b, "expected", get(kept, "z"))
+                put(kept, "z", reference)
             put(b, "r", reference)
         for k in range(min(W, c.bands - W * t)):
             log[row, W * t + k] = complex(b.target_re[k], b.target_im[k])

@@ -72,6 +72,7 @@ class BankController(Addressed):
             "tiles": self.tiles,
             "loops": aligned(loops, LOW_PASS),
             "window": aligned((int(settings.get("window", 0)), loops), PAIR),
+            "references": aligned(int(settings.get("late", 0)) * tiles, PAIR),
             "commands": aligned(history * tiles * 3, PAIR),  # of both coordinates; the finger's force
             "setpoints": self.setpoints,
             "work": aligned(2 * tiles, WORK),

@@ -189,6 +189,7 @@ def _settings(
         "back_calculation": min(model.pace / BACK_TIME, max(decay, TOUCHED_DECAY)),
         "dc_fast": 1.6 * fast,
         "dc_drift_fast": fast**2,
+        "late": model.delay if model.late else 0,
         "age": (model.delay + 0.5) / ADAPTATION_SAMPLES,
     }
 

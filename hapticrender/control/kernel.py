@@ -132,7 +132,7 @@ def predict(c, i):
     for t in range(c.tiles):
         b, x = record(c.tiles_at, TILE_T, t), record(coordinates_of(c, t), COORDINATE_T, i)
         carrier = get(b, "carrier")
-        reference = c.p.pattern[i] * real(get(b, "r") * carrier)
+        reference = c.p.pattern[i] * real(get(b, "expected") * carrier)
         shown = shown + (reference + real(get(x, "e") * carrier))
         command = command + (reference + real(get(x, "v") * carrier))
     return total(shown), total(command)
@@ -398,4 +398,4 @@ def observed_envelope(state):
     """Observed envelope (re, im) of band 0 in coordinate 0 of the controller at an address."""
     c = record(state, CONTROLLER_T, 0)
     b = record(c.tiles_at, TILE_T, 0)
-    return b.r_re[0] + b.e0_re[0], b.r_im[0] + b.e0_im[0]
+    return b.expected_re[0] + b.e0_re[0], b.expected_im[0] + b.e0_im[0]

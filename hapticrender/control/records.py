@@ -51,7 +51,7 @@ TILE_FIELDS = [
     "weight",  # 0..1, of the target
     "feedback",  # 0..1: weight of the feedback
     *_complex("target", "r", "slope"),  # target; reference R and dR/dt
-    *_complex("expected", "raw"),  # R in the block's middle; envelope of the waveform
+    *_complex("expected", "raw"),  # R in the block's middle, or `late` samples ago; envelope of the waveform
     *_complex("ahead"),  # rho: the turn by delay and hold
     *_complex("remainder"),  # stiffness of the finger beyond its three numbers
     *_complex("finger_force", "filtered_r"),  # adaptation: the finger's force, R and omega, delayed and filtered like
@@ -101,7 +101,7 @@ SETTINGS = np.dtype(
         ("loop", np.float64, (5,)),
         *(
             (name, np.int64)
-            for name in ("coordinates", "block", "group", "groups", "sensors", "channels", "n_taps", "window", "table")
+            for name in "coordinates block group groups sensors channels n_taps window table late".split()
         ),
     ]
 )
@@ -113,7 +113,7 @@ load lever contact law_contact law_lever finger_mass finger_damping finger_stiff
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
 gain damping_gain damper_scale dc_gain dc_drift_gain feedback_off
 """.split()
-_ARRAYS = "tiles loops commands setpoints work table phasors samples window gains"
+_ARRAYS = "tiles loops commands setpoints work table phasors samples window gains references"
 CONTROLLER = np.dtype(
     [
         ("p", SETTINGS),
