@@ -33,7 +33,7 @@ test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 test-slow: .venv/test.stamp ## run the long tests alone
-	@MPLBACKEND=Agg $(RUN) -m pytest -m slow $(PYTEST_ARGS)
+	@MPLBACKEND=Agg $(RUN) -m pytest -m slow $$(grep -l mark.slow tests/test_*.py) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
