@@ -152,7 +152,7 @@ class Late(AudioDriver):
 PROBED = 225  # blocks: 0.3 s, after which the loop begins
 
 
-@pytest.mark.parametrize(("at", "periods"), [(PROBED + 200, 28), (PROBED + 400, 90)])
+@pytest.mark.parametrize(("at", "periods"), [(PROBED + 400, 28), (PROBED + 400, 90)])
 def test_python_may_be_late(plate, tmp_path, at, periods):
     """By up to 32 blocks all that was sensed meanwhile arrives, so that nothing seems to jump; beyond it is lost.
 
