@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
+.PHONY: help demo test test-slow packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -31,6 +31,9 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
 	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(PYTEST_ARGS)
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
+
+test-slow: .venv/test.stamp ## run the long tests alone
+	@MPLBACKEND=Agg $(RUN) -m pytest -m slow $$(grep -l mark.slow tests/test_*.py) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)

@@ -90,8 +90,11 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
         given = np.asarray(value)
         if given.dtype.kind == "c":
             raise TypeError("it is complex")
-        with np.errstate(invalid="ignore"):
-            column = np.array(given, kind, order="C")  # a copy: the driver may use its own again
+        if given.dtype == kind:
+            column = given.copy()  # the driver may use its own again
+        else:
+            with np.errstate(invalid="ignore"):
+                column = np.array(given, kind, order="C")
         if name == "flags" and given.dtype.kind in "fO" and not (column == given).all():
             raise TypeError("it has fractions, NaN or infinity")
     except (TypeError, ValueError) as error:

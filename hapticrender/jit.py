@@ -243,7 +243,7 @@ def address_of(name: str, array: np.ndarray[Any, Any]) -> int:
     """Address of an array that the caller keeps alive; a ValueError where it is not C-contiguous."""
     if not array.flags.c_contiguous:
         raise ValueError(f"{name} of shape {array.shape}: must be C-contiguous (use numpy.ascontiguousarray)")
-    return array.ctypes.data
+    return int(array.__array_interface__["data"][0])  # a third of the time of `array.ctypes.data`, in every block
 
 
 class Addressed:

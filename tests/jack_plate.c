@@ -4,7 +4,8 @@
  * noise in full scales, then A, B, C and D row by row.  Ports are in_1.. and out_1..  Commands on standard input:
  *   run N     go through N periods as fast as all clients can (freewheel)
  *   free ON   1: go through periods as fast as all clients can, until 0
- *   pace MS   sleep in every period from now on: in freewheel all clients wait, and none is lost
+ *   pace MS   wait in every period from now on, for `next` or so long: in freewheel all clients wait, and none is lost
+ *   next      end the wait of this period, or of the coming one
  *   stall MS  sleep once inside a period: the server reports an overrun
  *   square N  square the last input, as a carrier does, and add N (a load)
  *   gain G Y N  multiply what is sensed, once N more periods are over and the first output is above Y, but not what is
@@ -13,7 +14,9 @@
  *   save FILE write what was recorded: float32, outputs without noise, then with it, a row a sample
  * The end of standard input ends it.
  */
+#include <errno.h>
 #include <jack/jack.h>
+#include <semaphore.h>
 #include <stdatomic.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -31,6 +34,7 @@ static float *record;
 static jack_client_t *client;
 static jack_port_t *in_port[MOST], *out_port[MOST];
 static atomic_long periods, overruns, pace, stall;
+static sem_t due;
 static uint64_t seed = 88172645463325252u;
 
 /* Sum of 12 uniform numbers: variance 1, peak 6. */
@@ -48,6 +52,15 @@ static double gauss(void) {
 static void pause_ms(long milliseconds) {
     struct timespec time = {milliseconds / 1000, milliseconds % 1000 * 1000000};
     nanosleep(&time, NULL);
+}
+
+static void wait_until_due(long milliseconds) {
+    struct timespec end;
+    clock_gettime(CLOCK_REALTIME, &end);
+    end.tv_nsec += milliseconds * 1000000;
+    end.tv_sec += end.tv_nsec / 1000000000;
+    end.tv_nsec %= 1000000000;
+    while (sem_timedwait(&due, &end) && errno == EINTR) continue;
 }
 
 static double row(const double *matrix, const double *vector, int n) {
@@ -84,8 +97,9 @@ static int process(jack_nframes_t frames, void *unused) {
         }
     }
     atomic_fetch_add(&periods, 1);
-    long sleep = atomic_exchange(&stall, 0) + atomic_load(&pace);
+    long sleep = atomic_exchange(&stall, 0), wait = atomic_load(&pace);
     if (sleep) pause_ms(sleep);
+    if (wait) wait_until_due(wait);
     return 0;
 }
 
@@ -140,6 +154,7 @@ static void obey(char *line) {
     if (sscanf(line, "run %ld", &number) == 1) run(number);
     if (sscanf(line, "free %ld", &number) == 1) jack_set_freewheel(client, (int)number);
     if (sscanf(line, "pace %ld", &number) == 1) atomic_store(&pace, number);
+    if (!strcmp(line, "next\n")) sem_post(&due);
     if (sscanf(line, "stall %ld", &number) == 1) atomic_store(&stall, number);
     if (sscanf(line, "save %4095[^\n]", name) == 1) save(name);
     printf("%ld %ld %u\n", atomic_load(&periods), atomic_load(&overruns), jack_frame_time(client));
@@ -148,7 +163,7 @@ static void obey(char *line) {
 
 int main(int argc, char **argv) {
     char line[4352], name[32];
-    if (argc != 3) return 2;
+    if (argc != 3 || sem_init(&due, 0, 0)) return 2;
     read_system(argv[2]);
     client = jack_client_open(argv[1], JackNoStartServer, NULL);
     if (!client) return 4;
