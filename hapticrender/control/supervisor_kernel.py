@@ -154,7 +154,8 @@ def is_broken(supervisor, lost):
 def check_sensors(supervisor, sensed, n, drive, acts):
     """Convert a sample's sensors to coordinates, an invalid one held; tests 1 and 2 against the sum of the drive.
 
-    Returns the cause, and the sensors that are invalid, as bits.  A drive that does not act (on a surface without a sliding finger) moves no sensor.
+    Returns the cause, and the sensors that are invalid, as bits.  A drive that does not act (on a surface without a
+    sliding finger) moves no sensor.
     """
     s = record(supervisor, SUPERVISOR_T, 0)
     p, cause, invalid, frozen, beyond, lost = s.p, 0, 0, 0, 0, False
