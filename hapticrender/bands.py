@@ -100,6 +100,11 @@ class Bands:
         return cls(frequency=np.zeros(0), wavenumber=np.zeros(0), phase=np.zeros(0), spatial=spatial)
 
     @property
+    def whole(self) -> bool:
+        """Whether the whole waveform is the target, as there are no carriers."""
+        return self.envelope is None and not len(self)
+
+    @property
     def follows_finger(self) -> bool:
         """Whether the whole target follows the finger."""
         return self.spatial or (len(self) > 0 and bool((self.wavenumber > 0.0).all()))

@@ -12,6 +12,7 @@ from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.bands import Bands
 from hapticrender.control.combined import CombinedBands, CombinedController, CombinedModel
 from hapticrender.control.device_model import DeviceModel
+from hapticrender.control.inverse import lookahead
 from hapticrender.control.state_transfer import ready
 from hapticrender.control.supervisor import FADE_OUT, SupervisedController, design_supervisor
 from hapticrender.driver_checks import check_sensed
@@ -89,7 +90,9 @@ class LiveLoop(RealtimeEntry):
     def __init__(self, rendering: Rendering, **scales: float) -> None:
         wrapped = bool(scales) and rendering.driver is not rendering.device
         converter = rendering.driver if wrapped else None
-        super().__init__(live_controller(rendering), frames=rendering.driver.block, converter=converter, **scales)
+        own, frames = live_controller(rendering), rendering.driver.block
+        ahead = lookahead(rendering.model) if isinstance(rendering.model, CombinedModel) else 0  # of whole waveforms
+        super().__init__(own, frames=frames, ahead=ahead, converter=converter, **scales)
         _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         self._calls_back = bool(scales)
@@ -104,8 +107,8 @@ class LiveLoop(RealtimeEntry):
         self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
         self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
         self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
-        own = rendering.plant is not None
-        self._touches = TouchWatch(rendering.model, self.controller, active=not own, slows=False)
+        real = rendering.plant is None
+        self._touches = TouchWatch(rendering.model, self.controller, active=real, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
         self.play(self._texture(rendering))
 
@@ -197,11 +200,9 @@ class LiveLoop(RealtimeEntry):
 
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
-        whole = self.whole and self.controller.n_bands == 0
-        bands = rendering.bands
-        if isinstance(bands, CombinedBands) and whole != (bands.envelope is None and not len(bands)):
-            raise ValueError("texture: a hybrid changes to, or from, a whole waveform in a new Player only")
-        return self._texture(rendering), self.controller if whole else live_controller(rendering)
+        last, bands = self._control.controller, rendering.bands
+        goes_on = last.bands.whole and (bands.whole or not isinstance(bands, CombinedBands))
+        return self._texture(rendering), last if goes_on else live_controller(rendering)
 
     def replace(self, rendering: Rendering, texture: SampledTexture | EvaluatedTexture, controller: Controller) -> None:
         """Fade into the texture of another rendering of the same device; texture and controller are `made` of it.
@@ -215,8 +216,8 @@ class LiveLoop(RealtimeEntry):
         for part, its_model in parts:
             if part is not None:
                 _widen(part, its_model)
-        if controller is not self.controller:
-            ready(controller)
+        if controller is not self._control.controller:
+            ready(controller, self._arrays["sensed"][-1])
         self.play(texture, controller)
         if rendering.shape is not None and hasattr(self._device, "reshape"):
             self._device.reshape(rendering.shape)

@@ -48,7 +48,7 @@ GAIN_TIME = 10e-3  # s
 CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers
 LOG_TIME = 2.0  # s: of signals that are kept
 BLOCK = ("sensed", "drive", "position", "waveform", "flags")  # signals of a block that all controllers share
-SAME = ("channels", "sensors", "block", "lookahead", "rate")  # of all controllers of an entry
+SAME = ("channels", "sensors", "block", "rate")  # of all controllers of an entry
 
 
 class _Control:
@@ -65,6 +65,7 @@ class _Control:
             state=controller.state,
             signals=self._signals,
             reads_waveform=controller.bands.envelope is None,
+            ahead=getattr(controller, "lookahead", 0),
             shared=self.shared,
             limit_at=self.limit,
         )
@@ -84,6 +85,8 @@ class RealtimeEntry(Addressed):
         Float sample at the output for a drive of 1 A, of all channels or of each.
     frames : int, samples, optional
         Of a call, a multiple of the controller's block, which it is unless given; `log` needs it.
+    ahead : int, samples, optional
+        Longest look-ahead of the controllers that are to come, where that is longer than the first one's.
     converter : WrappedDriver, optional
         What is between controller and device, such as a square root (see `hapticrender.renderers.shaped`).
 
@@ -93,9 +96,6 @@ class RealtimeEntry(Addressed):
         The pointer that belongs to both addresses.  The entry has to outlive whoever calls them.
     block : int, samples of the device
         Frames a call, or a multiple.
-    whole : bool
-        Whether the controller takes a waveform.  Of one with constant envelopes the gain is a factor of targets that
-        are modulated, and else ignored; another texture takes another controller (`play`).
 
     Raises
     ------
@@ -112,6 +112,7 @@ class RealtimeEntry(Addressed):
         sensed_scale: float | Array = 1.0,
         drive_scale: float | Array = 1.0,
         frames: int | None = None,
+        ahead: int = 0,
         converter: Any = None,
     ) -> None:
         if not isinstance(getattr(controller, "step", None), CFunction):
@@ -125,13 +126,12 @@ class RealtimeEntry(Addressed):
         self.block, self.frames = rows * hold, rows if frames is None else frames
         bound = f"a multiple of the controller's block of {controller.block} samples"
         require(self.frames > 0 and self.frames % controller.block == 0, "frames", frames, bound)
-        self.whole = controller.bands.envelope is None
         self._slot, self._slots, self._back = np.zeros(1, SLOT), np.zeros(SLOTS, SLOT), 0
         self._slot["position"], self._slot["playing"], self._slot["gain"] = np.nan, 1, 1.0
         self._slots[:] = self._slot
         self._textures: list[SampledTexture | EvaluatedTexture] = []
         self._writing = threading.Lock()  # of threads of the application; the callback never waits
-        self.ahead, self._tracker = int(getattr(controller, "lookahead", 0)), np.zeros(1, CONTROLLER)
+        self.ahead, self._tracker = max(int(getattr(controller, "lookahead", 0)), ahead), np.zeros(1, CONTROLLER)
         self._tracker["p"]["rate"] = self.rate
         self._arrays = self._buffers()
         for name, given, count in (
@@ -236,14 +236,15 @@ class RealtimeEntry(Addressed):
         """Fade from the texture that plays into another one, within `FADE`; one change after the other.
 
         A controller that works by bands takes another texture with a `controller` designed for it, on the same device:
-        the old texture fades out, the controller takes over, and its texture fades in (`CHANGE`).
+        the old texture fades out, the controller takes over, and its texture fades in (`CHANGE`).  Of constant
+        envelopes the gain is a factor where they are modulated, and else ignored.
         `control.state_transfer.ready` prepares it.
 
         Raises
         ------
         ValueError
-            The controller has another number of channels or sensors, block, look-ahead, rate or delay than the one
-            before, or the texture plays under another controller.
+            The controller has another number of channels or sensors, block, rate or delay than the one before, or a
+            longer look-ahead than the entry, or the texture plays under another controller.
         """
         last = self._control
         # addresses of textures that are, or may yet be, read
@@ -253,6 +254,8 @@ class RealtimeEntry(Addressed):
             found, first = (getattr(each, name, 0) for each in (controller, self.controller))
             if found != first:
                 raise ValueError(f"controller.{name} = {found}: must be {first}, as of the one before")
+        found = getattr(controller, "lookahead", 0)
+        require(found <= self.ahead, "controller.lookahead", found, f"<= {self.ahead}, `ahead` of the entry")
         if texture.address in used and texture.control.controller is not controller:
             raise ValueError("texture: plays under another controller: must be a new SampledTexture")
         if controller is not last.controller:

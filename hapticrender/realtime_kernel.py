@@ -31,9 +31,11 @@ SLOT = np.dtype(
 """What the application has set: the finger, the gain, the watchdog's time (samples; 0: none), whether anything plays,
 the texture's record; how often it has set the finger, and called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
-CONTROL = np.dtype([(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "shared", "limit_at")])
-"""Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor); the table of
-the state that it shares with others (see `control.state_transfer`); the drive's limit in every channel."""
+CONTROL = np.dtype(
+    [(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "ahead", "shared", "limit_at")]
+)
+"""Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor), and how far
+ahead; the table of the state that it shares with others (see `control.state_transfer`); the drive's limits."""
 CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
@@ -87,7 +89,8 @@ def receive(entry):
         e.offset = jump if abs(jump) < JUMP else 0.0
     if slot.texture != e.current and e.samples >= e.switch + duration(entry) and not waits(entry):  # one by one
         texture = record(slot.texture, TEXTURE_T, 0)
-        e.previous, e.current, e.switch = e.current, slot.texture, e.samples + e.ahead
+        e.previous, e.current = e.current, slot.texture
+        e.switch = e.samples + record(e.control, CONTROL_T, 0).ahead
         e.changes, texture.begun = 1 if texture.control != e.control else 0, e.switch
     return e.slots_at + e.slot * SLOT_SIZE
 
@@ -103,6 +106,42 @@ def shares(entry, sample):
 
 
 @kernel
+def texture_at(entry, sample, position, gain, touch):
+    """Texture at a sample, while one fades into the next one."""
+    e = record(entry, ENTRY_T, 0)
+    (before, present), total = shares(entry, sample), 0.0
+    if e.current != 0 and not waits(entry):
+        total += present * gain * value_at(e.current, sample, position, touch)
+    if e.previous != 0 and before > 0.0:
+        total += before * gain * value_at(e.previous, sample, position, touch)
+    return total
+
+
+@kernel
+def write_waveform(entry):
+    """Waveform of the block, as far ahead as the controller needs it (of bands: the gain); the texture into the log.
+
+    Gain and touch have waited in a ring, so that the log has what was handed to the controller.
+    """
+    e = record(entry, ENTRY_T, 0)
+    c, size = record(e.control, CONTROL_T, 0), e.ahead + e.block
+    waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (size, 2))
+    places = carray(pointer(e.places_at, F8), (2, e.block))
+    log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
+    for m in range(e.block):
+        now = e.samples + m
+        before, present = shares(entry, now)
+        newest, gone = (now + e.ahead) % size, (now + e.ahead - c.ahead) % size
+        if c.reads_waveform > 0:
+            place = places[1 if c.ahead > 0 else 0, m]
+            waveform[m] = texture_at(entry, now + c.ahead, place, gains[newest, 0], gains[newest, 1])
+        else:
+            waveform[m] = gains[newest, 0] * (before + present)
+        logged = texture_at(entry, now, places[0, m], gains[gone, 0], gains[gone, 1])
+        log[now % e.log_rows, e.channels + e.sensors + 2] = logged
+
+
+@kernel
 def step_controller(entry):
     """Advance the controller that runs by a block."""
     e = record(entry, ENTRY_T, 0)
@@ -114,18 +153,22 @@ def step_controller(entry):
 def take_over(entry):
     """Let the controller of the texture that begins take over: it goes on from the state of the one before.
 
-    That one computes this block too, so that the difference of the two drives is known.
+    That one computes this block too, so that the difference of the two drives is known.  What the next one is handed
+    may be another quantity, and further ahead.
     """
     e = record(entry, ENTRY_T, 0)
     texture, drive = record(e.current, TEXTURE_T, 0), carray(pointer(e.drive_at, F8), e.block * e.channels)
     bump, flags = carray(pointer(e.bump_at, F8), e.channels), carray(pointer(e.flags_at, I8), e.block)
-    transfer(record(e.control, CONTROL_T, 0).shared, record(texture.control, CONTROL_T, 0).shared)
+    control = record(texture.control, CONTROL_T, 0)
+    transfer(record(e.control, CONTROL_T, 0).shared, control.shared)
     step_controller(entry)
     for m in range(e.block):
         flags[m] &= ~STOPPED  # of this block the next one decides
     for i in range(e.channels):
         bump[i] = drive[i]
-    e.control, texture.begun, e.switch = texture.control, e.samples, e.samples - e.fade_out
+    e.control, texture.begun = texture.control, e.samples + control.ahead
+    e.switch = texture.begun - e.fade_out
+    write_waveform(entry)
     step_controller(entry)
     for i in range(e.channels):
         bump[i] -= drive[i]
@@ -138,12 +181,11 @@ def run_controller(entry):
     Their sum stays within the limit of the drive.
     """
     e = record(entry, ENTRY_T, 0)
-    changing = e.changes > 0 and e.switch + e.fade_out <= e.samples
-    if changing and waits(entry):
+    if waits(entry) and e.switch + e.fade_out <= e.samples:
         take_over(entry)
     else:
         step_controller(entry)
-    if changing and e.samples < e.switch + duration(entry):
+    if e.changes > 0 and not waits(entry) and e.samples < e.switch + duration(entry):
         drive, bump = carray(pointer(e.drive_at, F8), (e.block, e.channels)), carray(pointer(e.bump_at, F8), e.channels)
         limit = carray(pointer(record(e.control, CONTROL_T, 0).limit_at, F8), e.channels)
         flags = carray(pointer(e.flags_at, I8), e.block)
@@ -182,29 +224,11 @@ def follow_finger(entry, slot, m):
 
 
 @kernel
-def texture_at(entry, sample, position, gain, touch):
-    """Texture at a sample, while one fades into the next one."""
-    e = record(entry, ENTRY_T, 0)
-    (before, present), total = shares(entry, sample), 0.0
-    if e.current != 0:
-        total += present * gain * value_at(e.current, sample, position, touch)
-    if e.previous != 0 and before > 0.0:
-        total += before * gain * value_at(e.previous, sample, position, touch)
-    return total
-
-
-@kernel
 def play_texture(entry, slot):
-    """Waveform of the block, as far ahead as the controller needs it (of bands: the gain); the texture into the log.
-
-    Gain and touch wait in a ring meanwhile, so that the log has what was handed to the controller.
-    """
+    """Follow finger, gain and textures over a block, and hand the controller its waveform."""
     e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
     size = e.ahead + e.block
-    waveform, gains = carray(pointer(e.waveform_at, F8), e.block), carray(pointer(e.gains_at, F8), (size, 2))
-    places = carray(pointer(e.places_at, F8), (2, e.block))
-    log = carray(pointer(e.log_at, F8), (e.log_rows, e.log_width))
-    reads_waveform = record(e.control, CONTROL_T, 0).reads_waveform > 0
+    gains, places = carray(pointer(e.gains_at, F8), (size, 2)), carray(pointer(e.places_at, F8), (2, e.block))
     for m in range(e.block):
         places[0, m], places[1, m] = follow_finger(entry, slot, m)
         e.gain += e.gain_pole * (s.gain - e.gain)
@@ -214,17 +238,8 @@ def play_texture(entry, slot):
         evaluate(e.current, e.samples, e.ahead)
     if e.previous != 0 and shares(entry, e.samples)[0] > 0.0:
         evaluate(e.previous, e.samples, e.ahead)
-    for m in range(e.block):
-        now = e.samples + m
-        before, present = shares(entry, now)
-        gain, touch = gains[(now + e.ahead) % size, 0], gains[(now + e.ahead) % size, 1]
-        if reads_waveform:
-            waveform[m] = texture_at(entry, now + e.ahead, places[1, m], gain, touch)
-        else:
-            waveform[m] = gain * (before + present)
-        gain, touch = gains[now % size, 0], gains[now % size, 1]
-        log[now % e.log_rows, e.channels + e.sensors + 2] = texture_at(entry, now, places[0, m], gain, touch)
-    if e.current != 0 and runs_out(e.current, e.samples + e.ahead, e.block):
+    write_waveform(entry)
+    if e.current != 0 and runs_out(e.current, e.samples + record(e.control, CONTROL_T, 0).ahead, e.block):
         e.lost |= OVERRUN
     e.age += e.block
     e.taken += e.block

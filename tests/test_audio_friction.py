@@ -46,8 +46,9 @@ def test_a_screen_is_played_by_the_compiled_callback(connected, tmp_path):
 
 
 def test_a_hybrid_is_played_by_the_compiled_callback_and_changes_its_texture(connected, tmp_path):
-    """100 Hz, of which plate and screen make half each, then 80 Hz: skin velocity within 1 % and 1 degree.
+    """100 Hz, of which plate and screen make half each, 90 Hz as a whole waveform, by the plate, then 80 Hz.
 
+    Skin velocity within 1 % and 1 degree.
     By its sensors, of which 1 um at both ends is 4 um/s over half a second, and 4 mN 23; and as it truly is.
     """
     speed, load, scales, part = 0.08, 0.4, {}, SETTLED.stop - SETTLED.start
@@ -59,8 +60,12 @@ def test_a_hybrid_is_played_by_the_compiled_callback_and_changes_its_texture(con
     card = AudioDriver(CLIENT, (1, 2, 3), (1, 2, 3), delay=ROUND_TRIP, **scales)
     with hr.Player("hybrid", card) as player, ThreadPoolExecutor(1) as pool:
         player.finger(-0.08, speed, load)
-        for frequency in (100.0, 80.0):
-            player.play(hr.Grating(frequency=frequency, velocity=10e-3))
+        for frequency in (100.0, 90.0, 80.0):
+            texture = hr.Grating(frequency=frequency, velocity=10e-3)
+            whole = hr.Recorded(
+                samples=texture.waveform(np.arange(RATE) / RATE, np.zeros(round(RATE))), rate=RATE, gain=1.0
+            )
+            player.play(whole if frequency == 90.0 else texture)
             player.record(tmp_path / f"{frequency}.au")
             begin, running = player.time, pool.submit(run_paced, device)
             while not running.done():

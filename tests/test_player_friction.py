@@ -75,30 +75,33 @@ VIBRATING = {
 }
 
 
-@pytest.mark.parametrize("name", VIBRATING)
-def test_a_callback_vibrates_a_surface_as_a_thread_does(name):
-    """To rounding, through a change of texture; a stop is zero at once in both."""
+@pytest.mark.parametrize("name", [*VIBRATING, "hybrid"])
+def test_a_callback_plays_as_a_thread_does(name):
+    """To rounding, through changes of texture, on a hybrid to a whole waveform and back; a stop is zero at once."""
+    make, other, least = VIBRATING.get(name), hr.Grating(frequency=100.0, velocity=5e-3), 1.0  # V
+    if make is None:
+        make, other, least = bench, hr.Chirp(start=80.0, stop=200.0, duration=1.0, amplitude=10e-6), 0.05  # A
     first, second = (
-        hr.Scene(device="ultrasonic", finger=FINGER, duration=10.0, texture=each)
-        for each in (hr.Grating(frequency=100.0, velocity=5e-3), TEXTURE)
+        hr.Scene(device="hybrid" if make is bench else "ultrasonic", finger=FINGER, duration=10.0, texture=each)
+        for each in (TEXTURE, other)
     )
-    with VIBRATING[name]() as own, VIBRATING[name]() as called:
+    with make() as own, make() as called:
         thread = LiveLoop(hr.prepare(first, driver=own, compiled=False))
         callback = LiveLoop(hr.prepare(first, driver=called, compiled=False), sensed_scale=1.0, drive_scale=1.0)
         block, rate, played = thread.driver.block, thread.rate, [np.zeros((called.block, called.drive_channels))]
-        change, silence, end = (round(each * rate / block) for each in (0.05, 0.14, 0.15))
+        change, back, silence, end = (round(each * rate / block) for each in (0.05, 0.11, 0.17, 0.18))
         for n in range(end):
             for loop in (thread, callback):
                 loop.finger(float(FINGER.position(np.array([n * block / rate]))[0]), 0.08, 0.4)
-                if n == change:
-                    new = hr.prepare(second, driver=loop.rendering.device, compiled=False)
+                if n in (change, back):
+                    new = hr.prepare(second if n == change else first, driver=loop.rendering.device, compiled=False)
                     loop.replace(new, *loop.made(new))
                 if n == silence:
                     loop.silence()
             thread.advance(False)
             played.append(callback.process(called.play(played[-1]).sensed))
-    found, expected = (np.concatenate(each[:silence]) for each in (played, own.played))
-    assert abs(expected).max() > 1.0
+    found, expected = (np.concatenate(each[1:silence]) for each in (played, own.played))
+    assert abs(expected).max() > least
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
     assert not played[-1].any()
     assert not own.played[-1].any()

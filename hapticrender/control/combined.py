@@ -104,13 +104,12 @@ class CombinedController(Addressed):
         if not isinstance(bands, CombinedBands):
             raise ValueError("bands: must be CombinedBands, which share out what a device of two parts plays")
         self.method, self.bands, self.n_bands, self.step = getattr(method, "name", ""), bands, len(bands), combined_step
-        whole = bands.envelope is None and not len(bands)
-        shares = (model.plate, bands.plate, whole), (model.friction, bands.friction, False)
+        shares = (model.plate, bands.plate, bands.whole), (model.friction, bands.friction, False)
         self.parts = tuple(_designed(method, *share, feedback) for share in shares)
         sensors = (model.plate.coordinate_from_sensed.shape[1], 1) if feedback else (0, 0)
         self.part_channels = channels = (model.plate.force_from_drive.shape[1], 1)
         self.channels, self.sensors = sum(channels), sum(sensors)
-        self.lookahead = int(getattr(self.parts[0], "lookahead", 0)) if whole else 0
+        self.lookahead = int(getattr(self.parts[0], "lookahead", 0)) if bands.whole else 0
         self.rate = next((part.rate for part in self.parts if part is not None), 0.0)
         self.block = max(part.block if part is not None else 1 for part in self.parts)
         self.state = record_of(COMBINED, self, bands=self.n_bands)

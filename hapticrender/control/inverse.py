@@ -178,10 +178,11 @@ class AdaptiveInverse:
         Where the device itself is estimated (friction, a resonance), and for a recording on chosen carriers, the law
         works by bands; see `design_controller`.
         """
-        whole = bands.envelope is None and not len(bands)
-        if whole and model.mass[0, 0] == 0.0:  # friction without a sensor: of first order, but for the law's equations
+        if (
+            bands.whole and model.mass[0, 0] == 0.0
+        ):  # friction without a sensor: of first order, but for the law's equations
             model = replace(model, mass=model.stiffness / (2.0 * math.pi * model.rate) ** 2)
-        known = model.finger.contact is not None or (whole and model.mass[0, 0] > 0.0)
+        known = model.finger.contact is not None or (bands.whole and model.mass[0, 0] > 0.0)
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
@@ -190,14 +191,18 @@ class AdaptiveInverse:
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
         state = aligned(1, INVERSE)
-        ahead = model.delay + TAPS // 2
         rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(model.delay)}
         for name, value in law_settings(model, bands, feedback).items():
             state[name] = value
         for name, array in rings.items():
             state[f"{name}_at"] = array.ctypes.data
         memory = {"loops": state, **rings}
-        return WaveformController(self.name, inverse_step, settings, bands, arrays=memory, lookahead=ahead)
+        return WaveformController(self.name, inverse_step, settings, bands, arrays=memory, lookahead=lookahead(model))
+
+
+def lookahead(model: DeviceModel) -> int:
+    """Samples by which a whole waveform is read ahead."""
+    return model.delay + TAPS // 2
 
 
 def quiet_enough(damping: Damping, model: DeviceModel) -> bool:

@@ -132,7 +132,7 @@ def open_gate(controller, inverse, deviation):
     v.slow += v.high_pass_pole * (deviation - v.slow)
     above = deviation - v.slow
     v.power += v.mean_square_pole * (above * above - v.power)
-    second = deviation - 2.0 * c.past[0, (c.sample - 1) & PAST_MASK] + c.past[0, (c.sample - 2) & PAST_MASK]
+    second = deviation - 2.0 * c.past[0, (v.sample - 1) & PAST_MASK] + c.past[0, (v.sample - 2) & PAST_MASK]
     v.sensed_noise += NOISE_POLE * v.mean_square_pole * (second * second / 6.0 - v.sensed_noise)
     noise = max(v.gate_threshold, min(4.0 * v.sensed_noise, MOST_NOISE * v.gate_threshold))
     large, closed = v.power > noise, c.fast_open == 0.0
@@ -145,10 +145,10 @@ def open_gate(controller, inverse, deviation):
 
 
 @kernel
-def damp(controller, coordinate, deviation):
+def damp(controller, inverse, coordinate, deviation):
     """Force of the inner damper, F = -sum c_j dev[n - j], and `damper_force` before its gain; `past` is a ring."""
     c = record(controller, CONTROLLER_T, 0)
-    now, force = c.sample & PAST_MASK, 0.0
+    now, force = record(inverse, INVERSE_T, 0).sample & PAST_MASK, 0.0
     c.past[coordinate, now] = deviation
     if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
@@ -295,14 +295,14 @@ def inverse_step(state, signals, start, count):
             reset_parameters(inverse, FINGER, PARAMETERS)
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
-                error0, error1 = c.past[0, (c.sample - 1) & PAST_MASK], c.past[1, (c.sample - 1) & PAST_MASK]
+                error0, error1 = c.past[0, (v.sample - 1) & PAST_MASK], c.past[1, (v.sample - 1) & PAST_MASK]
             elif open_gate(state, inverse, error0) and v.since > v.initial_end and c.p.needs_contact == 0.0:
                 suspect_change(inverse)
             for i in range(c.p.coordinates):
                 error = error0 if i == 0 else error1
                 if learning and implausible == 0:
                     learn(inverse, i, error)
-                samples[FORCE + i, 0] = damp(state, i, error)
+                samples[FORCE + i, 0] = damp(state, inverse, i, error)
         if v.sample % REVERSION == 0:
             revert(inverse)
         if v.sample % REFRESH == 0:

@@ -61,15 +61,19 @@ def state_table(controller: Any) -> Array:
     return np.array(rows + [(0, 0)] * (ROWS - len(rows)), np.int64)
 
 
-def ready(controller: Any) -> None:
+def ready(controller: Any, sensed: Array) -> None:
     """Prepare a controller at rest to take over under a finger: its targets are there, and what it has yet to find.
 
-    A part that nothing is transferred to first finds the steady friction, as after a touch.
+    A part that nothing is transferred to first finds the steady friction, as after a touch.  To the inner damper of a
+    plate what is `sensed` now (sensors,) is no step.
     """
     for part in _parts(controller):
         bank = getattr(part, "controller", part)
         if bank is not None:
             bank.tiles["fade"], bank.state["fresh"] = 1.0, FRESH_TIME * bank.rate
+        if isinstance(bank, WaveformController):
+            sag = np.nan_to_num(bank.settings["coordinate_from_sensor"][:, : bank.sensors] @ sensed[: bank.sensors])
+            bank.law["fade"], bank.law["slow"], bank.state["past"][0] = 1.0, sag[0], sag[:, None]
 
 
 def drive_limits(controller: Any) -> Array:
@@ -106,12 +110,12 @@ def _blocks(part: Any) -> dict[str, Block]:
         return found
     at = state.ctypes.data
     found["tracker"] = _fields(at, CONTROLLER, "held_position", "fresh")
-    finger = _fields(at, CONTROLLER, "fresh", "past")  # and the rounding
     if not isinstance(part, WaveformController):
-        return found | {"finger": finger}
+        return found | {"finger": _fields(at, CONTROLLER, "fresh", "past")}  # and the rounding
+    # the same fields, which mean other things there, and what the damper remembers
+    found |= {"contact": _fields(at, CONTROLLER, "fresh", "sample")}
     law, at, delay = part.law, int(state["loops_at"][0]), int(part.law["delay"])
-    found |= {"contact": finger}  # the same fields, which mean other things there
-    found |= {"learned": _fields(at, INVERSE, "fade", "ring_at"), "window": _fields(at, INVERSE, "window")}
+    found |= {"learned": _fields(at, INVERSE, "peak", "ring_at"), "window": _fields(at, INVERSE, "window")}
     return found | {"ring": (int(law["ring_at"]), RING * (delay + 1)), "reference": (int(law["reference_at"]), delay)}
 
 
