@@ -1,7 +1,7 @@
 # Every verb works from a fresh clone: the environment is made, and made anew only when pyproject.toml changes.
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
+.PHONY: help demo test packages audio-test board-test test-oldest lint bench charts paper docs wheel clean
 .DELETE_ON_ERROR:
 
 # The first interpreter that runs, is new enough and can make an environment; override with PYTHON=/path/to/python.
@@ -16,7 +16,7 @@ OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr 
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
 # Tests that play in real time run first, one after the other; the rest on two cores.  test_audio_verbs paces its card.
 # What fails of them is run once more: a machine that has other work loses samples, and JACK now and then a wake-up.
-REAL_TIME := $(addprefix tests/test_,audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py)
+REAL_TIME := $(addprefix tests/test_,audio_carrier.py audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py)
 FAILED_AT := -o cache_dir=build/real_time
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_profile.py board_textures.py \
@@ -34,9 +34,6 @@ test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out
 	@MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(FAILED_AT) $(PYTEST_ARGS) \
 		|| MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) $(FAILED_AT) --last-failed --last-failed-no-failures none $(PYTEST_ARGS)
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
-
-test-slow: .venv/test.stamp ## run the long tests alone
-	@MPLBACKEND=Agg $(RUN) -m pytest -m slow $$(grep -l mark.slow tests/test_*.py) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)

@@ -15,8 +15,6 @@ from hapticrender.accuracy.suite import CASES, METHOD_FREE, TARGETS, as_rows, ru
 from hapticrender.protocols import Flag
 from hapticrender.recordings.columns import unwrap_counts
 
-pytestmark = pytest.mark.slow
-
 MISSES = {  # bounds that the default method misses: each is in docs/figures.md, or within its last digit there
     "white modes": {"free", "slide"},
     "tones bent": {"finger"},
@@ -38,6 +36,7 @@ def test_every_case_has_its_targets_and_every_target_its_case():
     assert set(CASES) > METHOD_FREE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", [case for case in CASES if case not in ON_THE_STRANGERS_PLATE])
 def test_the_default_method_keeps_every_bound_but_those_known(case):
     figures = run_suite(["inverse"], [case])

@@ -79,7 +79,6 @@ def test_standard_errors_are_right(studied):
     assert all(0.60 < share < 0.76 for share in shares.values()), shares
 
 
-@pytest.mark.slow
 def test_a_finger_on_a_third_party_s_plate_is_measured_as_well():
     """Bending glass, whose mode the profile has 2 % too low; 3 sigma of the share of 2 x 64 errors."""
     subject = population(16, 101)[5]
@@ -108,7 +107,6 @@ def test_recorded_truth_is_not_read(studied):
     np.testing.assert_array_equal(again.impedance.value, found.impedance.value)
 
 
-@pytest.mark.slow
 def test_no_false_contact_in_ten_minutes():
     """Eight carriers on a plate that is 2 % off its profile, in blocks of 4 s; then 0.1 N are seen at once."""
     rate, block = 5000, 20_000

@@ -15,8 +15,6 @@ from hapticrender.accuracy.signals import recorded
 from hapticrender.accuracy.suite import run_suite
 from hapticrender.touch.finger import Finger
 
-pytestmark = pytest.mark.slow
-
 ON_THE_STRANGERS_PLATE = {  # cases, and the bounds that they miss; all others are played in test_accuracy.py
     "white": set(),
     "white wrong": set(),

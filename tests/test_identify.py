@@ -122,7 +122,6 @@ def test_the_bending_mode_of_a_third_partys_plate_is_found(bending, rate, true):
     assert identified.explained
 
 
-@pytest.mark.slow
 def test_a_bending_mode_is_found_from_five_standard_deviations_on():
     """A shape of .003 at the coils is 7 of them; .001 and a rigid plate with a command of 10 bits show no mode."""
     find = lambda coil, **how: identify(StrangersPlate(bending=(1250.0, 30, coil), **how), PAPER)  # noqa: E731
@@ -150,7 +149,6 @@ def test_what_was_identified_of_bending_reaches_the_design(coil):
         assert model.bending.coupling[0] == pytest.approx(coil / 9.5e-3, rel=0.05)
 
 
-@pytest.mark.slow
 def test_a_third_partys_plate_is_held_although_everything_is_wrong():
     """k +5, m -5, b -20 %, gains +-2 %, a sample late: the wave's mean amplitude within 3 % at every place."""
     plate = StrangersPlate(**WRONG, told=2, bending=(1250.0, 30, 0.1))

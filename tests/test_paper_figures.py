@@ -36,7 +36,6 @@ RECOMPUTED = (  # derived independently of this code, to the last printed digit 
 )
 
 
-@pytest.mark.slow
 def test_everything_is_reproduced_but_the_known_corrections():
     """In one test, as every worker would compute the items anew."""
     items = {name: compute() for name, compute in paper.ITEMS.items()}
