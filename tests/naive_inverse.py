@@ -53,7 +53,7 @@ class NaiveInverse:
             self.discretise()
         beta, d1, d2 = self.find_basis(n)
         nominal = self.K @ self.alpha * beta[0] + self.C @ self.alpha * d1 + self.M @ self.alpha * d2
-        force = nominal + self.directions() @ self.significant() + self.levelling_force()
+        force = nominal + self.directions() @ self.theta[:COUNT] + self.levelling_force()
         force = force - (self.open * p["damper_high"]) * (self.taps * self.past).sum(axis=1)
         drive = self.play(force)
         self.forces.append((beta, self.to_force @ drive - nominal))
@@ -195,14 +195,6 @@ class NaiveInverse:
         found[0, HEAVE : HEAVE + 4] = self.alpha[0] * basis[[0, 1, 2, 5]]
         found[1, COUPLING : COUPLING + 3] = basis[:3]
         return found
-
-    def significant(self):
-        """Parameters as they are played: of the device's own only what exceeds the sensors' noise."""
-        theta = self.theta.copy()
-        for i in range(HEAVE, COUPLING):
-            noise = self.law["shrinkage"] * self.P[i, i]
-            theta[i] = theta[i] - noise / theta[i] if theta[i] ** 2 > noise else 0.0
-        return theta
 
     def levelling_force(self):
         target = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)

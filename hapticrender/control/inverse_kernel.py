@@ -158,14 +158,6 @@ def damp(controller, inverse, coordinate, deviation):
 
 
 @kernel
-def significant(inverse, i):
-    """Shrink a parameter by what the sensors' noise makes of it (positive part): theta max(0, 1 - lambda P/theta^2)."""
-    v = record(inverse, INVERSE_T, 0)
-    value, insignificant = v.theta[i], v.shrinkage * v.covariance[i, i]
-    return value - insignificant / value if value * value > insignificant else 0.0
-
-
-@kernel
 def learned_force(controller, inverse):
     """What was learned of finger and device, as the forces that it takes in heave and rocking."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
@@ -174,11 +166,10 @@ def learned_force(controller, inverse):
     for i in range(5):
         finger += theta[FINGER + i] * basis[i]
     for i in range(3):
-        heave += significant(inverse, HEAVE + i) * basis[i]
+        heave += theta[HEAVE + i] * basis[i]
         rocking += theta[COUPLING + i] * basis[i]
     finger *= v.contact * (c.p.pattern[0] + v.lever * c.p.pattern[1])
-    heave += significant(inverse, HEAVE + 3) * basis[5]
-    return finger + c.p.pattern[0] * heave, v.lever * finger + rocking
+    return finger + c.p.pattern[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
 
 
 @kernel

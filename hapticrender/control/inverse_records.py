@@ -41,7 +41,6 @@ INVERSE = np.dtype(
         ("noise", np.float64, (2,)),  # variances of heave and rocking: 6 (sensor noise)^2, first part of sigma_e^2
         *((name, np.float64) for name in ("deviations", "innovations")),  # weights of mean squares in `model_power`
         ("model_error", np.float64),  # part of `model_power` in sigma_e^2
-        ("shrinkage", np.float64),  # part of P that is taken off theta^2 of the device's own parameters: noise's
         ("prior", np.float64, (ROWS - 1,)),  # mean
         ("prior_covariance", np.float64, (ROWS - 1, ROWS - 1)),
         ("reversion_factor", np.float64, (ROWS - 1,)),  # a_i: share of the distance from the prior that stays
