@@ -119,7 +119,7 @@ def _demand(setup: SurfaceSetup) -> Demand:
 
 def _model(setup: SurfaceSetup, driver: Driver | Port) -> DeviceModel:
     """Device model without its drive limit; the amplitude's interpolation adds half a sample, and a driver its lag."""
-    assumed, lag = setup.assumed, 0.5 / driver.rate + getattr(driver, "lag", 0.0)
+    assumed, lag = setup.assumed, 0.5 / driver.rate + (driver.lag if isinstance(driver, ResonantDriver) else 0.0)
     model = setup.contact(driver, 1.0)
     if driver.sensed_channels and assumed.sensor == "amplitude":  # no contact and no tribometer between
         return replace(setup.inferred(model, lag), sensor_delay=0.0, sensed_noise=LEAST_NOISE * model.sensed_limit)

@@ -28,12 +28,12 @@
 enum { MOST = 64 };
 
 static int states, inputs, outputs;
-static long length, recorded, healthy;
+static long length, recorded;
 static double noise, load = -1.0, gain = 1.0, next_gain = 1.0, above = 1e9, a[MOST][MOST], b[MOST][MOST], c[MOST][MOST], d[MOST][MOST], x[MOST];
 static float *record;
 static jack_client_t *client;
 static jack_port_t *in_port[MOST], *out_port[MOST];
-static atomic_long periods, overruns, pace, stall;
+static atomic_long periods, overruns, pace, stall, healthy;
 static sem_t due;
 static uint64_t seed = 88172645463325252u;
 
@@ -148,7 +148,7 @@ static void obey(char *line) {
     char name[4096];
     sscanf(line, "square %lf", &load);
     if (sscanf(line, "gain %lf %lf %ld", &factor, &level, &number) == 3) {
-        healthy = atomic_load(&periods) + number;
+        atomic_store(&healthy, atomic_load(&periods) + number);  /* before what waits for it */
         next_gain = factor, above = level;
     }
     if (sscanf(line, "run %ld", &number) == 1) run(number);

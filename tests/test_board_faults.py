@@ -316,6 +316,7 @@ def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatc
     assert set(gains) <= set(session.gains)
     assert session.client.reconnections > seconds / 60
     assert faults.faulty == pytest.approx(0.01 * faults.carried, rel=0.1)
+    assert session.silences
     for incarnation, start, stop in session.silences:
         drives = driven(logs[incarnation], start + int(0.1 * RATE), stop)
         assert not drives, f"{drives} after the cable was pulled at {start}"

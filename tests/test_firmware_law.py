@@ -105,6 +105,10 @@ FAULTS = {
     "not finite": (causes.INVALID, lambda sensed: np.nan * sensed),
     "every third": (causes.INVALID, lambda sensed: np.where(np.arange(len(sensed)) % 3, sensed, np.nan)),
     "5 ms are lost": (0, lambda sensed: np.where(np.arange(len(sensed)) % 507 < 25, np.nan, sensed)),
+    "inverted, every fourth lost": (
+        causes.SENSOR_GAIN,
+        lambda sensed: np.where(np.arange(len(sensed)) % 4, -sensed, np.nan),
+    ),
     "frozen": (causes.FROZEN, lambda sensed: 0.0 * sensed + 1e-6),
     "inverted": (causes.INCONSISTENT, lambda sensed: -sensed),
     "swings far": (causes.OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),

@@ -55,6 +55,12 @@ FAULTS = {  # what is sensed instead: bounds of time (s) and motion (m), and wha
     "one dead": (lambda plate, sensed: sensed * (1.0, 0.0), 8e-3, 250e-6, "sensor 2: one value repeats"),
     "at its range": (lambda plate, sensed: 0 * sensed + 1e-3, 8e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
     "NaN": (lambda plate, sensed: np.nan * sensed, 8e-3, 250e-6, "sensor 1 and 2: samples are no numbers"),
+    "inverted, every fourth lost": (
+        lambda plate, sensed: (-1.0 if len(plate.played) % 4 else np.nan) * sensed,
+        8e-3,
+        250e-6,
+        "sensor 1 and 2: the samples are suddenly -",
+    ),
     "noisy": (noise, 8e-3, 250e-6, "sensor 1 and 2: the samples are suddenly"),
 }
 

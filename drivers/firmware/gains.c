@@ -129,7 +129,8 @@ static uint32_t judge_gains(const gains_t *s, uint32_t kind, real_t noise, uint3
 }
 
 /* Add a sample to a trial, and judge sensors at its end. */
-static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
+static void follow_sensors(
+    gains_t *s, const gain_settings_t *p, uint32_t invalid, const real_t force[2], gain_faults_t *faults)
 {
     const real_t none[2] = {REAL(0.0), REAL(0.0)};
     const real_t shown[2] = {model_sensor(s->models[MOTION], p, 0u), model_sensor(s->models[MOTION], p, 1u)};
@@ -138,6 +139,7 @@ static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t fo
     for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
             w[j][i] -= model_sensor(s->models[RESPONSE + j], p, i);
+            w[j][i] = ((invalid & (1u << i)) != 0u) ? REAL(0.0) : w[j][i];
         }
     }
     add_sums(s, SENSOR, REAL(1.0), (const real_t (*)[2])w);
@@ -154,13 +156,14 @@ static void follow_sensors(gains_t *s, const gain_settings_t *p, const real_t fo
 }
 
 /* Add a sample to the means, and judge actuators. */
-static void follow_actuators(gains_t *s, const gain_settings_t *p, const real_t force[2], gain_faults_t *faults)
+static void follow_actuators(
+    gains_t *s, const gain_settings_t *p, uint32_t invalid, const real_t force[2], gain_faults_t *faults)
 {
     real_t(*const models)[6] = &s->models[RESPONSE + GAIN_CHANGES];
     real_t w[GAIN_CHANGES][2];
     for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         for (uint32_t i = 0u; i < 2u; i++) {
-            w[j][i] = model_sensor(models[j], p, i);
+            w[j][i] = ((invalid & (1u << i)) != 0u) ? REAL(0.0) : model_sensor(models[j], p, i);
         }
     }
     if (s->watched > p->duration / 2u) { /* by then w no longer depends on where it began */
@@ -208,11 +211,11 @@ gain_faults_t gains_check(
         (void)memcpy(s->models[MOTION], s->models[STATE], sizeof(s->models[MOTION]));
     }
     if (s->left > 0u) {
-        follow_sensors(s, p, force, &faults);
+        follow_sensors(s, p, invalid, force, &faults);
     }
     if (s->energy[ACTUATOR] > WATCHED * p->innovation) {
         s->watched += 1u;
-        follow_actuators(s, p, force, &faults);
+        follow_actuators(s, p, invalid, force, &faults);
     } else if (s->watched != 0u) {
         clear_sums(s, ACTUATOR);
         s->watched = 0u;

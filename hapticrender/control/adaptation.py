@@ -29,7 +29,7 @@ def reset_finger(c):
         b = record(c.tiles_at, TILE_T, t)
         put(b, "remainder", 0.0)
         put(b, "finger_force", 0.0)
-        put(b, "filtered_r", get(b, "r"))
+        put(b, "filtered_r", get(b, "expected") if c.p.block == 1 else get(b, "r"))
         put(b, "filtered_omega", get(b, "omega"))
         put(b, "complete", 1.0)
         for i in range(c.p.coordinates):

@@ -248,4 +248,5 @@ def _in_blocks(settings: Mapping[str, Any], block: int, rate: float) -> dict[str
         "damper": 0.0,
         "damper_high": 0.0,
         "lock": 0.0,
+        "late": 0,
     }

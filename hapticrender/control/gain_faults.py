@@ -190,13 +190,22 @@ def judge_gains(s, kind, noise):
 
 
 @kernel
-def follow_sensors(s, force0, force1):
+def leave_out(s, j, invalid):
+    """A change shows nothing in a sample that is invalid."""
+    for i in range(2):
+        if invalid & 1 << i:
+            s.w[j, i] = 0.0
+
+
+@kernel
+def follow_sensors(s, invalid, force0, force1):
     """Add a sample to a trial; at its end the sensors whose gain has changed, as bits, and whether they are swapped."""
     p0, p1 = model_sensors(s, MOTION)
     for j in range(CHANGES):
         known0, known1 = model_sensors(s, RESPONSE + j)
         s.w[j, 0] = (p0 if j == 0 else p1 - p0 if j == SWAP else 0.0) - known0
         s.w[j, 1] = (p1 if j == 1 else p0 - p1 if j == SWAP else 0.0) - known1
+        leave_out(s, j, invalid)
     add_sums(s, SENSOR, 1.0)
     s.energy[SENSOR] += s.e[0] * s.e[0] + s.e[1] * s.e[1]
     advance_model(s, MOTION, force0, force1)
@@ -208,11 +217,12 @@ def follow_sensors(s, force0, force1):
 
 
 @kernel
-def follow_actuators(s, force0, force1):
+def follow_actuators(s, invalid, force0, force1):
     """Add a sample to the means; the actuators that are inverted, as bits, and whether they are swapped."""
     first = RESPONSE + CHANGES * ACTUATOR
     for j in range(CHANGES):
         s.w[j, 0], s.w[j, 1] = model_sensors(s, first + j)
+        leave_out(s, j, invalid)
     if s.watched > s.duration // 2:  # by then w no longer depends on where it began
         add_sums(s, ACTUATOR, s.window_pole)
     for j in range(CHANGES):
@@ -256,10 +266,10 @@ def check_gains(gains, sensed, sensors, invalid, force0, force1):
         for i in range(6):
             s.models[MOTION, i] = s.models[STATE, i]
     if s.left > 0:
-        sensor_faults, sensors_swapped = follow_sensors(s, force0, force1)
+        sensor_faults, sensors_swapped = follow_sensors(s, invalid, force0, force1)
     if s.energy[ACTUATOR] > WATCHED * s.innovation:
         s.watched += 1
-        actuator_faults, actuators_swapped = follow_actuators(s, force0, force1)
+        actuator_faults, actuators_swapped = follow_actuators(s, invalid, force0, force1)
     elif s.watched > 0:
         clear_sums(s, ACTUATOR)
         s.watched = 0
