@@ -44,7 +44,7 @@ def fast(jack_program, tmp_path):
         card = Card(CLIENT, *channels, rate=FAST, block=SHORT, **options)
         card.probe = False
         card.system = stack.enter_context(
-            jack_ring.device(jack_program, tmp_path, system, length=round(20 * FAST), noise=noise)
+            jack_ring.device(jack_program, tmp_path, system, length=round(120 * FAST), noise=noise)
         )
         return card.system, card
 
