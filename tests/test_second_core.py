@@ -14,19 +14,20 @@ from hapticrender.plants.plate_kernels import FUNCTIONS
 START = """
 import numpy as np
 from hapticrender import jit, second_core
-from hapticrender.plants.plate_kernels import FUNCTIONS, times
+from hapticrender.plants.plate_kernels import FUNCTIONS, PLATE, sum_series
 {change}
 for function in FUNCTIONS.values():
     function.expect()
-assert times.address
+assert sum_series.address
 """
 SCRIPT = """
 (child,) = set(second_core.CHILDREN.values())
 assert len(second_core.CHILDREN) == len(FUNCTIONS) - 1 and not second_core.EXPECTED
 assert all(function.address for function in FUNCTIONS.values())
-matrix, w, product = np.arange(88.0), np.ones(11), np.zeros(8)
-times(matrix.ctypes.data, w.ctypes.data, product.ctypes.data)
-assert np.array_equal(product, matrix.reshape(11, 8).sum(axis=0))
+plate, term = jit.aligned(1, PLATE), np.arange(8.0)
+plate["system"][0, :8], plate["term"][0, :8] = np.eye(8), term
+sum_series(plate.ctypes.data)
+assert np.allclose(plate["total"][0], (np.e - 1) * term)  # (exp(A) - 1)/A, of the identity
 print("child", child.returncode)
 """
 
@@ -54,7 +55,7 @@ def test_what_a_child_does_not_compile_is_compiled_here(tmp_path, change, ended)
         for done in ("saved to", "loaded from")
     )
     assert (lines[-1] == "child 0") == ended
-    assert here == ({"times"} if ended else set(FUNCTIONS))
+    assert here == ({"sum_series"} if ended else set(FUNCTIONS))
     assert loaded == set(FUNCTIONS) - here
     if ended:  # what is in the cache needs no child
         lines_of("assert not second_core.CHILDREN", tmp_path)
