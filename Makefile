@@ -17,7 +17,7 @@ OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate
 # Tests that play in real time run first, one after the other; the rest on two cores.  test_audio_verbs paces its card.
 # What fails of them is run once more, and that is said: a machine that has other work loses samples, and JACK now and
 # then a wake-up.
-REAL_TIME := $(addprefix tests/test_,audio_carrier.py audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py)
+REAL_TIME := $(addprefix tests/test_,audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py audio_carrier.py)
 IN_REAL_TIME := MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) -o cache_dir=build/real_time
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_profile.py board_textures.py \
