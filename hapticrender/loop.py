@@ -32,6 +32,7 @@ from hapticrender.touch.scene import Scene
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
+PIECE = 0.02  # s of signal that is looked through and recorded at once, where blocks are shorter
 
 Progress = Callable[[float, float], None]
 
@@ -143,19 +144,21 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     with stopped_by_signal(), recorder, ended_with_program() as ending, opened(driver, device):
         if rendering.probe is not None:
             rendering.probe(device)
-        loop, fault = _Loop(rendering), None
+        loop = _Loop(rendering)
         try:
             for start in range(0, total, loop.step):
-                keep(loop.advance(start, min(loop.step, total - start)))
-                if fault := loop.fault(start):
+                loop.advance(start, min(loop.step, total - start))
+                keep(loop.known())
+                if loop.faded:
                     break
                 if ending.is_set():
                     raise SystemExit("the program has ended")
                 if progress is not None:
                     progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
         finally:
+            keep(loop.known())
             keep(loop.rest())
-        if fault:
+        if fault := loop.fault():
             fault.recording = recorder.finish()
             raise fault
         compared = differences(rendering, getattr(device, "learned", loop.controller))
@@ -290,9 +293,9 @@ class _Loop:
     def __init__(self, rendering: Rendering) -> None:
         self.rendering, self.controller = rendering, rendering.controller()
         driver = rendering.driver
-        loop = _device_loop(driver, self.controller)
-        self._device_loop = self._block if loop is None else loop
-        self.step = driver.block * (max(int(CHUNK * driver.rate / driver.block), 1) if loop is not None else 1)
+        self._device_loop = _device_loop(driver, self.controller)
+        piece = PIECE if self._device_loop is None else CHUNK
+        self.step = driver.block * max(int(piece * driver.rate / driver.block), 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
@@ -302,24 +305,41 @@ class _Loop:
         self._recent = np.zeros(0, int)  # flags
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
+        self._played: list[dict[str, Array]] = []  # blocks since `known`
+        self._first, self._next, self._count = 0, 0, 0  # their first sample, the one after, and how many are recorded
 
-    def advance(self, start: int, count: int) -> dict[str, Any]:
-        """Advance by `count` samples from sample `start` on; a last block is cut in the record, not on the device."""
-        self._start = start
-        drive, target, flags, sensed = self._device_loop(count, self._reference)
-        if self._stopped < 0:
-            self._recent = np.append(self._recent, flags)[-round(RECENT * self.rendering.driver.rate) :]
-            if (flags & STOPPED).any():
-                self._stopped = start + int(np.argmax(flags & STOPPED))
-        values, time = sensed.sensed, self._time(len(sensed.sensed))
-        finger = self.rendering.scene.finger
-        position = finger.position(time) if sensed.position is None else sensed.position
-        load = finger.load(time) if sensed.normal_load is None else sensed.normal_load
-        signals = {"drive": drive, "sensed": values, "position": position, "normal_load": load}
-        signals |= {"target": target, "flags": flags}
+    def advance(self, start: int, count: int) -> None:
+        """Play `count` samples from sample `start` on; an error leaves what was played until then to `known`."""
+        self._start = self._first = start
+        self._count = count
+        if self._device_loop is not None:
+            self._keep(*self._device_loop(count, self._reference))
+            return
+        time, finger, block = self._time(self.step), self.rendering.scene.finger, self.rendering.driver.block
+        position, load = finger.position(time), finger.load(time)
+        for first in range(0, count, block):
+            self._start = start + first
+            self._exchange(position[first : first + block], load[first : first + block])
+            if self.faded:
+                break
+
+    def known(self) -> dict[str, Any]:
+        """Signals of what was played, as far as its motion is known; a last block is cut here, not on the device."""
+        if not self._played:
+            return {"flags": np.zeros(0, int)}
+        played, self._played = self._played, []
+        names = [name for name in played[0] if name != "motion"]
+        signals = {name: np.concatenate([each[name] for each in played]) for name in names}
+        motion = [each["motion"] for each in played if "motion" in each]
+        if motion:  # the first of it holds for what was played before
+            missing = len(signals["flags"]) - sum(map(len, motion))
+            signals["motion"] = np.concatenate([np.repeat(motion[0][:1], missing, axis=0), *motion])
+        flags = signals["flags"]
+        if self._stopped >= 0:
+            flags = flags[: max(self._stopped + 1 - self._first, 0)]
+        self._recent = np.append(self._recent, flags)[-round(RECENT * self.rendering.driver.rate) :]
         signals["flags"] = self._touches.update(signals)
-        signals |= {} if sensed.motion is None else {"motion": sensed.motion}
-        return self._due({name: signal[:count] for name, signal in signals.items()})
+        return self._due({name: signal[: self._count] for name, signal in signals.items()})
 
     def rest(self) -> dict[str, Any]:
         """Signals of the samples that are held back for their motion, at the end: as if they went on as they came."""
@@ -331,15 +351,23 @@ class _Loop:
         on = {name: np.pad(each, ends[name], "reflect", reflect_type="odd") for name, each in held.items()}
         return held | self._moved(on)
 
-    def fault(self, start: int) -> DeviceFault | None:
-        """Return why the drive was stopped, once it has faded out in the samples from `start` on."""
-        rate, driver = self.rendering.driver.rate, self.rendering.driver
-        if self._stopped < 0 or start + self.step < self._stopped + FADE_OUT * rate + driver.delay:
+    @property
+    def faded(self) -> bool:
+        """Whether the drive was stopped, and has faded out on the device."""
+        driver = self.rendering.driver
+        return 0 <= self._stopped <= self._next - FADE_OUT * driver.rate - driver.delay
+
+    def fault(self) -> DeviceFault | None:
+        """Return why the drive was stopped, if it was."""
+        if self._stopped < 0:
             return None
         return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
-    def _block(self, count: int, reference: Callable[[Array], Array]) -> tuple[Array, Array, Array, Sensed]:
-        """Exchange a block with the driver; the drive computed from it is played with the next one."""
+    def _exchange(self, position: Array, load: Array) -> None:
+        """Exchange a block with the driver; the drive computed from it is played with the next one.
+
+        `position` and `load` are the finger's by the scene, for a driver that states none.
+        """
         driver: Any = self.rendering.driver
         played = self._drive
         if hasattr(driver, "resting"):
@@ -348,19 +376,31 @@ class _Loop:
         sensed = check_sensed(driver, driver.play(played.copy()), places, self._has_motion)
         self._has_motion = sensed.motion is not None
         self._itself |= stops_itself(sensed, self.controller)
-        position = sensed.position
-        if position is None:
-            position = self.rendering.scene.finger.position(self._time(driver.block))
-        sensed = sensed._replace(position=position)
+        position = position if sensed.position is None else sensed.position
+        load = load if sensed.normal_load is None else sensed.normal_load
         device: Any = self.rendering.device
         if sensed.flags is not None and hasattr(device, "host_delay") and hasattr(self.controller, "unplayed"):
             device_delay = self.rendering.model.delay - device.host_delay
             self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
-        self._drive, target, flags = self.controller.run(sensed.sensed, position, reference(position))
-        return played, target, flags if sensed.flags is None else flags | sensed.flags, sensed
+        self._drive, target, flags = self.controller.run(sensed.sensed, position, self._reference(position))
+        flags = flags if sensed.flags is None else flags | sensed.flags
+        self._keep(played, target, flags, Sensed(sensed.sensed, position, sensed.motion, load))
+
+    def _keep(self, drive: Array, target: Array, flags: Array, sensed: Sensed) -> None:
+        """Keep what was played from sample `_start` on for `known`."""
+        self._next = self._start + len(flags)
+        if self._stopped < 0 and np.bitwise_or.reduce(flags) & STOPPED:
+            self._stopped = self._start + int(np.argmax(flags & STOPPED))
+        position, load, finger = sensed.position, sensed.normal_load, self.rendering.scene.finger
+        signals = {"drive": drive, "sensed": sensed.sensed, "target": target, "flags": flags}
+        signals["position"] = finger.position(self._time(len(flags))) if position is None else position
+        signals["normal_load"] = finger.load(self._time(len(flags))) if load is None else load
+        self._played.append(signals | ({} if sensed.motion is None else {"motion": sensed.motion}))
 
     def _reference(self, position: Array) -> Array:
-        if self._ahead == 0 or self.rendering.bands.envelope is not None:
+        if self.rendering.bands.envelope is not None:
+            return np.zeros(len(position))
+        if self._ahead == 0:
             return self.rendering.reference(self._time(len(position)), position)
         time = self._time(len(position)) + self._ahead / self.rendering.driver.rate
         return self.rendering.reference(time, self._predict(position))

@@ -44,6 +44,7 @@ WRONG = {  # beside the plate that a controller is designed for
     "delay": 2,
 }
 FORCE_CONSTANT, ARM, REACH, MODAL_MASS = 7.4, 27.5e-3, 55e-3, 9.5e-3  # N/A, m, m, kg
+DRAWN = 1000  # blocks of noise at once
 BAR = 2.365020372431352  # half the first root of cos(x) cosh(x) = 1
 
 
@@ -135,7 +136,7 @@ class StrangersPlate:
         self._touch = [self._course(each) for each in (position, load, contact)]
         self._lag, self._substeps = round(report_lag * rate), substeps or (6 if rate < 20e3 else 2)
         self._queue, self._at, self._courses = np.zeros((late, 2)), 0, np.empty((0, 3))  # courses: from -lag on
-        self._rng = np.random.default_rng(seed)
+        self._rng, self._drawn = np.random.default_rng(seed), []
         self._z, self._truth, self._contact = self._equilibrium(), [], []
 
     @classmethod
@@ -225,7 +226,9 @@ class StrangersPlate:
         self._truth.append(truth)
         self._contact.append(touch[:-1, 2])
         sensed = truth[:, 1:3] * [self.true["gain_1"], self.true["gain_2"]]
-        sensed += self.noise * self._rng.standard_normal(sensed.shape)
+        if not len(self._drawn):  # a block at a time takes as long as the plate
+            self._drawn = list(self.noise * self._rng.standard_normal((DRAWN, *sensed.shape)))[::-1]
+        sensed += self._drawn.pop()
         if self.sensor_step:
             sensed = np.minimum(np.maximum(self.sensor_step * np.round(sensed / self.sensor_step), -1e-3), 1e-3)
         touching = self._touched(first - self._lag, last - 1 - self._lag)[:, 2] > 0.0

@@ -108,8 +108,8 @@ class TouchMonitor:
         self.tests = self.detections = 0
         self.two = False
 
-    def update(self, drive: Array, sensed: Array, position: Array, flags: Array) -> int:
-        """Take the next samples and return `Flag.TWO_TOUCHES` while two fingers touch, else 0.
+    def update(self, drive: Array, sensed: Array, position: Array, flags: Array) -> Array:
+        """Take the next samples and return `Flag.TWO_TOUCHES` of each by which two fingers are known to touch, else 0.
 
         `drive` (n, channels) and `sensed` (n, sensors) are as played and measured, `position` (n,) is that of the
         finger (m, NaN while lifted); windows with samples whose `flags` (n,) are `UNUSABLE` are left out.
@@ -117,11 +117,14 @@ class TouchMonitor:
         self._pieces.append(np.column_stack((drive, sensed, position, flags & UNUSABLE)))
         self._count += len(position)
         need = self.length + TAPS - 1 + self._late
+        raised = np.full(len(position), TWO_TOUCHES * self.two)
         while self._count >= need:
+            last = len(position) - 1 - (self._count - need)  # of the window
             rows = np.concatenate(self._pieces)
             rows = rows[self._take(rows[:need]) :]
             self._pieces, self._count = [rows], len(rows)
-        return TWO_TOUCHES if self.two else 0
+            raised[last:] = TWO_TOUCHES * self.two
+        return raised
 
     def restart(self) -> None:
         """Begin a new window: samples are missing here."""

@@ -170,6 +170,7 @@ class CombinedController(Addressed):
                 part.unplayed(samples)
 
     run = BankController.run
+    _kept: Any = None  # by it
 
 
 def _designed(method: Method, model: DeviceModel | None, bands: Bands, whole: bool, feedback: bool) -> Any:

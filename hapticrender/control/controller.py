@@ -41,6 +41,8 @@ class BankController(Addressed):
     is to be `lookahead` samples ahead.
     """
 
+    _kept: tuple[dict[str, Array], Array, tuple[int, ...]] | None = None  # signals, record, arguments of the last run
+
     def __init__(
         self,
         method: str,
@@ -121,16 +123,19 @@ class BankController(Addressed):
         n = len(sensed)
         if n % self.block:
             raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")
-        drive, target = np.zeros((n, self.channels)), np.zeros((n // self.block, self.n_bands), complex)
-        flags = np.zeros(n, np.int64)
-        arrays = {
-            "sensed": np.ascontiguousarray(sensed, float),
-            "position": np.ascontiguousarray(position, float),
-            "waveform": np.ascontiguousarray(waveform, float),
-        }
-        signals = addresses(drive=drive, target=target, flags=flags, **arrays)
-        self.step(self.state.ctypes.data, signals.ctypes.data, 0, n)
-        return drive, np.repeat(target, self.block, axis=0) if self.block > 1 else target, flags
+        kept = self._kept  # of blocks of this length: their addresses take longer than the step
+        if kept is None or len(kept[0]["flags"]) != n:
+            signals = {"sensed": np.zeros((n, self.sensors)), "position": np.zeros(n), "waveform": np.zeros(n)}
+            signals |= {"drive": np.zeros((n, self.channels)), "flags": np.zeros(n, np.int64)}
+            signals["target"] = np.zeros((n // self.block, self.n_bands), complex)
+            record = addresses(**signals)
+            self._kept = kept = signals, record, (self.state.ctypes.data, record.ctypes.data, 0, n)
+        signals, _, arguments = kept
+        signals["sensed"][:], signals["position"][:], signals["waveform"][:] = sensed, position, waveform
+        signals["flags"][:] = 0
+        self.step(*arguments)
+        target = signals["target"].copy() if self.block == 1 else np.repeat(signals["target"], self.block, axis=0)
+        return signals["drive"].copy(), target, signals["flags"].copy()
 
 
 class PositionPredictor:
