@@ -50,7 +50,7 @@ def require(good: bool, key: str, value: object, bound: str, error: type[Excepti
 
 
 def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+    return type(value) is float or (isinstance(value, Real) and not isinstance(value, bool | np.bool_))
 
 
 def _bound(kind: str, unit: str, above: End, least: End, most: End) -> str:

@@ -19,7 +19,7 @@ def recorded(values: Array, high: float = 500.0, exponent: float = 0.0) -> Recor
     inside = (frequency >= 20.0) & (frequency <= high)
     spectrum[inside] *= frequency[inside] ** (exponent / 2)
     values = np.fft.irfft(np.where(inside, spectrum, 0.0), len(values))
-    return Recorded(samples=tuple(values), rate=FINE, gain=RMS / float(np.sqrt(np.mean(values**2))))
+    return Recorded(samples=tuple(values.tolist()), rate=FINE, gain=RMS / float(np.sqrt(np.mean(values**2))))
 
 
 def white(seed: int) -> Recorded:

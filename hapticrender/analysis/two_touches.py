@@ -223,16 +223,17 @@ class TouchMonitor:
             across[0] -= self._rest[1] - lever.mean() * self._rest[0]
         spread, best = POSITION_ERROR * self.model.lever_per_metre, 0.0
         mean, noise = float(lever.mean()), self._noise[len(self._noise) - along.size :]
+        fixed = float(self._known @ np.linalg.solve(self._information, self._known))
         for width in (1.0, 0.25, 0.0625):
             errors = best + spread * width * SEARCH
             values = [self._value(across - d * along, rows[0] - d * rows[1], noise, mean + d) for d in errors]
             totals = np.array(values) + (errors / spread) ** 2
-            best, statistic = float(errors[np.argmin(totals)]), float(totals.min())
+            best, statistic = float(errors[np.argmin(totals)]), fixed + float(totals.min())
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
 
     def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
-        """T without its term of d, for one d: least squares over the plate's errors and the position's lateness."""
+        """T for one d, but for its terms without the data: least squares over the plate's errors and lateness."""
         combine = np.array([-lever, 1.0])
         variance = np.einsum("i,kij,j->k", combine, noise, combine)
         weight = 2.0 / variance
@@ -240,8 +241,7 @@ class TouchMonitor:
             weight[0] = 1.0 / variance[0]
         matrix = self._information + ((rows.conj() * weight) @ rows.T).real
         vector = self._known + ((rows.conj() * weight) @ left).real
-        fixed = self._known @ np.linalg.solve(self._information, self._known)
-        return float(np.sum(weight * abs(left) ** 2) + fixed - vector @ np.linalg.solve(matrix, vector))
+        return float(np.sum(weight * abs(left) ** 2) - vector @ np.linalg.solve(matrix, vector))
 
 
 def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[float, TouchTest]]:

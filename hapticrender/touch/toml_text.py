@@ -75,7 +75,7 @@ def _value(value: Any) -> str:
     if isinstance(value, int | float):
         return repr(value)
     if isinstance(value, list | tuple):
-        entries = [*map(_value, value)]
+        entries = [repr(each) if type(each) is float else _value(each) for each in value]
         line = ", ".join(entries)
         if len(line) <= LONGEST_LINE:
             return f"[{line}]"
