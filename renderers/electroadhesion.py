@@ -72,8 +72,8 @@ class ScreenSetup(FrictionSetup):
         assumed, mu = self.assumed, self.assumed.friction_coefficient
         model = self.contact(driver, mu)
         if driver.sensed_channels and assumed.sensor == "impedance":  # attraction, behind the estimator's low pass
-            lag, sensed = assumed.estimator_filter.delay, mu * model.coordinate_from_sensed
-            return replace(self.inferred(model, lag), coordinate_from_sensed=sensed, sensor_delay=lag)
+            sensed = mu * model.coordinate_from_sensed
+            return replace(self.inferred(model, assumed.sensor_delay), coordinate_from_sensed=sensed)
         return model
 
 

@@ -138,7 +138,7 @@ class FrictionSetup:
         sliding, speed, sensed = self.assumed, self.speed, driver.sensed_channels > 0
         lag = sliding.memory_length / speed
         w0 = 2 * np.pi * sliding.tribometer_frequency
-        ring = 2 * sliding.tribometer_damping / w0 if sensed else 0.0
+        ring = sliding.sensor_delay if sensed else 0.0
         own = 1.0 / friction_per_drive
         one = np.eye(1)
         return DeviceModel(

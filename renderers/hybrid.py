@@ -148,7 +148,7 @@ class HybridRenderer(BaseRenderer):
         model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
         displacement = lever[:, None] * model.coordinate_from_sensed
-        late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
+        late = setup.screen.assumed.sensor_delay  # of a later texture, where this one leaves the screen alone
         return HybridDriver(driver, self.shape(setup), displacement, setup.velocity_per_force, late)
 
     def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
