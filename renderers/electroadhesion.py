@@ -88,7 +88,11 @@ class ElectroadhesionRenderer(FrictionRenderer):
         check_tables(scene, ElectroadhesionParameters.names(), ElectroadhesionSettings.names(), LEVEL)
         with inside("render"):
             settings = ElectroadhesionSettings(**scene.rendering)
-        return ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
+        setup = ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
+        assumed, current = setup.assumed, setup.assumed.drive_kind == "current"
+        source = (assumed.current_limit, "A") if current else (assumed.voltage_limit, "V")
+        carrier_limit(scene.device_profile.limits, *source)  # refuses what no finger's load could make right
+        return setup
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen with the scene's finger on it."""

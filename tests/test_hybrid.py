@@ -169,6 +169,15 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     assert recording.header.motion_source == "sensors"  # a velocity that is computed is none that is known
 
 
+def test_a_velocity_that_a_driver_states_waits_for_no_sensor():
+    """Half a sample of a tone of 250 Hz is 8 % of it."""
+    device = bench()
+    device.tell = lambda sample, sensed: sensed
+    recording = hr.render(replace(scene(tone(250.0), duration=0.6), settle=0.4), driver=device)
+    motion, reference = recording.motion[-1000:, 0], recording.reference[-1000:]
+    assert (motion - reference).std() < 0.04 * reference.std()
+
+
 @pytest.mark.parametrize(
     ("spoil", "named"),
     [
