@@ -20,7 +20,7 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
 ``calibration`` (optional)
     relative uncertainty of the sensors' gain (0.01 is 1 %), which the verdict adds to its figures
 ``drive_limit`` (optional)
-    A: largest drive that it plays, below which identification stays
+    A: largest drive that all of its channels play, below which identification stays
 ``probe`` (optional)
     False where the start-up probe is to be left out (docs/safety.md)
 ``by_host()`` (optional)

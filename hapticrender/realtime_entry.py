@@ -120,6 +120,10 @@ class RealtimeEntry(Addressed):
         if converter is not None and not any(getattr(converter, each, None) for each in ("act", "sense")):
             bound = "must have compiled steps, `act` or `sense`, where the device calls back"
             raise TypeError(f"converter of type {type(converter).__name__}: {bound}")
+        own = next((vars(each) for each in type(converter).__mro__ if "play" in vars(each)), {"act": None})
+        if not {"act", "sense"} & own.keys():  # those that it inherits do not what its `play` does
+            bound = "must have compiled steps of its own beside its own `play` where the device calls back"
+            raise TypeError(f"converter of type {type(converter).__name__}: {bound}")
         self.controller = controller
         self.converter, self.rate = converter, float(controller.rate)
         rows, hold = (controller.block, 1) if converter is None else (converter.block, converter.hold)

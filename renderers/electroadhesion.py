@@ -72,8 +72,8 @@ class ScreenSetup(FrictionSetup):
         assumed, mu = self.assumed, self.assumed.friction_coefficient
         model = self.contact(driver, mu)
         if driver.sensed_channels and assumed.sensor == "impedance":  # attraction, behind the estimator's low pass
-            lag, sensed = assumed.estimator_filter.delay, mu * model.coordinate_from_sensed
-            return replace(self.inferred(model, lag), coordinate_from_sensed=sensed, sensor_delay=lag)
+            sensed = mu * model.coordinate_from_sensed
+            return replace(self.inferred(model, assumed.sensor_delay), coordinate_from_sensed=sensed)
         return model
 
 
@@ -88,7 +88,11 @@ class ElectroadhesionRenderer(FrictionRenderer):
         check_tables(scene, ElectroadhesionParameters.names(), ElectroadhesionSettings.names(), LEVEL)
         with inside("render"):
             settings = ElectroadhesionSettings(**scene.rendering)
-        return ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
+        setup = ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
+        assumed, current = setup.assumed, setup.assumed.drive_kind == "current"
+        source = (assumed.current_limit, "A") if current else (assumed.voltage_limit, "V")
+        carrier_limit(scene.device_profile.limits, *source)  # refuses what no finger's load could make right
+        return setup
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen with the scene's finger on it."""

@@ -138,7 +138,7 @@ class FrictionSetup:
         sliding, speed, sensed = self.assumed, self.speed, driver.sensed_channels > 0
         lag = sliding.memory_length / speed
         w0 = 2 * np.pi * sliding.tribometer_frequency
-        ring = 2 * sliding.tribometer_damping / w0 if sensed else 0.0
+        ring = sliding.sensor_delay if sensed else 0.0
         own = 1.0 / friction_per_drive
         one = np.eye(1)
         return DeviceModel(
@@ -182,8 +182,10 @@ class FrictionSetup:
 
 
 def carrier_limit(limits: Limits, most: float, unit: str) -> float:
-    """Largest peak of a carrier, `most` (`unit`) or within the limits of peak and rms drive, of a sine."""
+    """Largest peak of a carrier, `most` (`unit`) or within the limits of peak and rms drive, of a sine; no others."""
     check_limits(limits, most, unit)
+    bound = "left out: it bounds the sensors of plates; of a screen or an ultrasonic surface limit the drive"
+    require(limits.displacement is None, "limits.displacement", limits.displacement, bound)
     return min(most, limits.peak_drive or np.inf, np.sqrt(2.0) * (limits.rms_drive or np.inf))
 
 
@@ -194,8 +196,6 @@ class FrictionRenderer(BaseRenderer):
 
     def protected(self, limits: Limits, model: DeviceModel) -> DeviceModel:
         """Return `model`: its drive is a friction, and the setup has the limits of the carrier; see `carrier_limit`."""
-        bound = "left out: it bounds the sensors of plates; of a screen or an ultrasonic surface limit the drive"
-        require(limits.displacement is None, "limits.displacement", limits.displacement, bound)
         return model
 
     def waveform(self, setup: FrictionSetup, texture: Texture) -> Waveform:

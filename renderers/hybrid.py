@@ -63,9 +63,9 @@ class HybridDriver(ShapedDriver):
 
     def __init__(self, driver: Driver, root: Any, displacement: Array, velocity_per_force: float, late: float) -> None:
         super().__init__(driver, root)
-        self.motion_delay = max(late, 0.5 / self.rate)  # s, of `motion`
+        self._late = max(late, 0.5 / self.rate)  # s, of a velocity that is computed
         self.displacement, self.velocity_per_force = displacement, velocity_per_force
-        self._waits = self.motion_delay * self.rate - 0.5  # samples, as a difference is half a sample late
+        self._waits = self._late * self.rate - 0.5  # samples, as a difference is half a sample late
         self.early = math.ceil(self._waits) + 1  # samples before those whose velocity is computed
         self._last = np.zeros((self.early, self.sensed_channels))
 
@@ -81,7 +81,7 @@ class HybridDriver(ShapedDriver):
 
     def skin(self, sensed: Array, position: Array) -> Array:
         """Velocity of the skin (m/s, shape (n, 1)), from the sensors, `motion_delay` late; less the first `early`."""
-        self.motion_source = "sensors"
+        self.motion_source, self.motion_delay = "sensors", self._late
         with np.errstate(invalid="ignore"):  # a faulty sensor is the controller's to flag
             glass = sensed[:, :SENSORS] @ self.displacement.T
             rates = on_time(self.rate * np.diff(glass, axis=0, prepend=glass[:1]), len(glass), -self._waits)
@@ -148,7 +148,7 @@ class HybridRenderer(BaseRenderer):
         model = plate.device_model(driver.rate, driver.delay)
         lever = np.array([1.0, 1.0 / plate.half_spacing])
         displacement = lever[:, None] * model.coordinate_from_sensed
-        late = setup.screen.model(_part_of(driver, 1, 1, "screen")).sensor_delay if setup.friction else 0.0
+        late = setup.screen.assumed.sensor_delay  # of a later texture, where this one leaves the screen alone
         return HybridDriver(driver, self.shape(setup), displacement, setup.velocity_per_force, late)
 
     def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:

@@ -37,10 +37,8 @@ class ResonantDriver(WrappedDriver):
     Notes
     -----
     `delay` is the block and the whole samples of friction in the device's own delay, `lag` (s) what is left of that:
-    the amplitude follows its target that much later, and the friction's controller is to foresee it.  Behind 1, 16 and
-    48 samples at 192 kHz 200 and 400 Hz come 1.0, 2.0 and 3.9 samples of friction late, and within 0.3 % of their
-    targets.  The amplitude's loop (`loop`) and its resonance lock step with every sample of the device, however long
-    its blocks are.
+    the amplitude follows its target that much later, and the friction's controller is to foresee it.  The amplitude's
+    loop (`loop`) and its resonance lock step with every sample of the device, however long its blocks are.
     """
 
     sense = resonant_sense

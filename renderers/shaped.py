@@ -111,7 +111,7 @@ class ShapedDriver(WrappedDriver):
     def reshape(self, root: Any) -> None:
         """Let the bias rise to that of another `SquareRoot` within `FADE`; a smaller one is not taken."""
         values = {"floor": root.floor / root.bias, "gain": root.gain, "straight": root.straight, "goal": root.bias}
-        for name, value in values.items():  # the goal last: a callback may run
+        for name, value in values.items():  # the goal last: until then a callback has no bias, or what it had before
             self.state[name] = value
 
     def convert(self, drive: Array) -> Array:

@@ -17,7 +17,7 @@ from hapticrender.control.supervisor import governed
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import BaseRenderer, check_tables, read_devices
+from hapticrender.renderers.base import BaseRenderer, check_limits, check_tables, read_devices
 from hapticrender.renderers.limits import check_carriers, check_path, check_targets, demand, perceptible
 from hapticrender.touch.scene import Scene
 
@@ -46,7 +46,9 @@ class VibrotactileRenderer(BaseRenderer):
         check_tables(scene, PlateParameters.names(), ("probe",), level=LEVEL)
         probe = scene.rendering.get("probe", True)
         require(isinstance(probe, bool), "render.probe", probe, "true or false", TypeError)
-        return PlateSetup(scene, *read_devices(scene, PlateParameters, LEVEL), probe)
+        setup = PlateSetup(scene, *read_devices(scene, PlateParameters, LEVEL), probe)
+        check_limits(scene.device_profile.limits, setup.assumed.current_limit, "A", setup.assumed.sensor_range / 2)
+        return setup
 
     def plant(self, setup: PlateSetup, seed: int) -> Plate:
         """Return the simulated plate with the scene's finger on it."""

@@ -169,6 +169,15 @@ def test_a_driver_of_ones_own_gets_currents_and_is_judged_by_its_sensors():
     assert recording.header.motion_source == "sensors"  # a velocity that is computed is none that is known
 
 
+def test_a_velocity_that_a_driver_states_waits_for_no_sensor():
+    """Half a sample of a tone of 250 Hz is 8 % of it."""
+    device = bench()
+    device.tell = lambda sample, sensed: sensed
+    recording = hr.render(replace(scene(tone(250.0), duration=0.6), settle=0.4), driver=device)
+    motion, reference = recording.motion[-1000:, 0], recording.reference[-1000:]
+    assert (motion - reference).std() < 0.04 * reference.std()
+
+
 @pytest.mark.parametrize(
     ("spoil", "named"),
     [
@@ -304,8 +313,8 @@ def test_a_part_that_does_not_play_leaves_the_other_limits():
         assert (limits > 0.0).tolist() == [bool(each) for each in plays]
 
 
-@pytest.mark.parametrize("live", [False, True])
-def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
+@pytest.mark.parametrize("first", [None, tone(250.0), tone(30.0)], ids=["rendered", "live", "live, after the plate"])
+def test_friction_is_judged_at_the_time_of_the_motion(first, tmp_path):
     """A tone of 250 Hz is on the screen alone, and shown 2 zeta/w0 = 159 us late: 25 % of it, where that is left in.
 
     What remains is 0.65 % of the tribometer beside its delay, 0.3 % of the lines between samples, and the noise of a
@@ -313,8 +322,9 @@ def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
     """
     plays, driver = replace(scene(tone(250.0), duration=1.5), settle=0.5), bench()
     driver.tell = lambda sample, sensed: Sensed(sensed.sensed, position=sensed.position)  # and where the finger is
-    if live:
+    if first:
         with hr.Player(plays, driver, paced=False) as player:
+            player.play(first)
             player.play(plays.texture)
             player.sleep(0.5)
             player.record(tmp_path / "live.au")
@@ -322,7 +332,7 @@ def test_friction_is_judged_at_the_time_of_the_motion(live, tmp_path):
             recording = player.end_recording()
     else:
         recording = hr.render(plays, driver=driver)
-    rows = slice(len(recording) - 10_000 if not live else 0, len(recording))
+    rows = slice(0 if first else len(recording) - 10_000, len(recording))
     turn = np.exp(-2j * np.pi * 250.0 * np.arange(len(recording)) / RATE)[rows]
     motion, reference = recording.motion[rows, 0] @ turn, recording.reference[rows] @ turn
     assert abs(motion / reference - 1.0) < 0.01 + 5 * 0.0074

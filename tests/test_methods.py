@@ -56,7 +56,7 @@ def test_any_split_into_blocks_gives_the_same_run(name, block, rng):
 
 @pytest.mark.parametrize("name", sorted(set(METHODS) - {"inverse"}))  # it expects a finger where one is said to be
 def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
-    """cos(2 pi x/wavelength) at +v and -v; and a finger that turns round at 0.6 s meets it again in mirror image."""
+    """cos(2 pi x/wavelength) at +v and -v; and a finger that turns round at 0.6 s passes it again in mirror image."""
     time = np.arange(6001) / RATE
     motion = {}
     for way, position in (

@@ -330,6 +330,8 @@ def test_a_device_that_cannot_be_is_refused_at_once(device, error, message):
         ({"profile": {"massive": 1.0}}, ValueError, "device.massive = 1.0: unknown key; known: "),
         ({"simulation": {"massive": 1.0}}, ValueError, "simulation.massive = 1.0: unknown key; known: "),
         ({"profile": {"rate": -1.0}}, ValueError, "device.rate = -1.0: must be a finite number >= "),
+        ({"limits": {"peak_drive": 400.0}}, ValueError, r"\[limits\] peak_drive = 400 [AV]: must be <= .*left out"),
+        ({"limits": {"displacement": 1.0}}, ValueError, r"displacement = 1(.0| m): must be .*left out"),
         ({"rendering": {"probe": 1}}, TypeError, "render.probe = 1: must be true or false"),
     ],
 )

@@ -1,6 +1,7 @@
 """What fails in live play on screens, ultrasonic surfaces and hybrids: the drive of the device itself is zero."""
 
 import copy
+from dataclasses import replace
 from functools import partial
 from itertools import product
 
@@ -105,6 +106,30 @@ def test_a_callback_plays_as_a_thread_does(name):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 * abs(expected).max())
     assert not played[-1].any()
     assert not own.played[-1].any()
+
+
+class Written(np.ndarray):
+    """A record that calls `seen` after every field that is written."""
+
+    def __setitem__(self, name, value):
+        super().__setitem__(name, value)
+        self.seen()
+
+
+@pytest.mark.parametrize("first", [hr.Grating(frequency=40.0, velocity=5e-3), TEXTURE], ids=["plate alone", "both"])
+def test_a_callback_while_the_root_is_changed_plays_the_old_one_or_the_new(first):
+    """After every field that is written: up to the last one nothing changes; then the bias rises, in 50 ms."""
+    louder = hr.Grating(frequency=100.0, velocity=20e-3)
+    scene = hr.Scene(device="hybrid", texture=first, finger=FINGER, duration=1.0)
+    driver, played = hr.prepare(scene, driver=bench(), compiled=False).driver, []
+    driver.state = driver.state.view(Written)
+    driver.state.seen = lambda: played.append(driver.convert(np.zeros((driver.block, 3)))[-1, 2])
+    before = driver.convert(np.zeros((driver.block, 3)))[-1, 2]
+    shape = hr.prepare(replace(scene, texture=louder), driver=bench(), compiled=False).shape
+    driver.reshape(shape)
+    np.testing.assert_allclose(played[:-1], before, rtol=1e-12)
+    assert (before == 0.0) == (first is not TEXTURE)
+    assert before < played[-1] < before + shape(0.0) / 20  # a sample of 500 is 1/22 of it, by the root
 
 
 def unplug(sensed):

@@ -32,7 +32,7 @@ from hapticrender.plants.levels import least_model
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.realtime_entry import RealtimeEntry
-from hapticrender.renderers.shaped import Port, WrappedDriver
+from hapticrender.renderers.shaped import Port, ShapedDriver, WrappedDriver
 from hapticrender.sampled_texture import SampledTexture
 from hapticrender.sweep import sweep
 from hapticrender.touch.mechanics import LIGHT_SECOND, NONE
@@ -45,6 +45,13 @@ TONE = hr.Grating(frequency=100.0, velocity=10e-3)
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 PANEL = TouchPanel()
 WHITE = {"samples": [0.0, 1.0], "rate": 100.0}
+
+
+class Louder(ShapedDriver):
+    """A driver that a compiled callback, which takes the steps that it inherits, would play as no louder."""
+
+    def play(self, drive):
+        return super().play(2.0 * drive)
 
 
 def grating(**changes):
@@ -280,6 +287,10 @@ DRIVERS = [
     (
         lambda: RealtimeEntry(in_blocks(), converter=WrappedDriver(Port(1e3, 1, 1))),
         "converter of type WrappedDriver: must have compiled steps",
+    ),
+    (
+        lambda: RealtimeEntry(in_blocks(), converter=Louder(Port(1e3, 1, 1), None)),
+        "converter of type Louder: must have compiled steps of its own beside its own `play`",
     ),
     (lambda: RealtimeEntry(in_blocks(), frames=64), "frames = 64: must be a multiple of the controller's block of 25"),
     (lambda: entry().finger(0.0, np.nan), "must be finite"),

@@ -143,6 +143,11 @@ class ElectroadhesionParameters(SlidingParameters):
         """The STDFT* of the estimator, which is also its response to a small change of |I|^2."""
         return StarSTDFT(bandwidth=self.estimator_bandwidth, rate=self.rate)
 
+    @property
+    def sensor_delay(self) -> float:
+        """Delay of what is sensed (s): of the tribometer, or of the estimator."""
+        return self.estimator_filter.delay if self.sensor == "impedance" else super().sensor_delay
+
     def area(self, normal_load: Any) -> Any:
         """Electrical contact area (m2) under `normal_load` (N)."""
         return self.area_scale * self.electrical_share * self.contact_area * np.power(normal_load, self.area_exponent)

@@ -57,6 +57,11 @@ class SlidingParameters(Validated):
 
     force_step = resolution("force_bits", "force_range", 2.0, "the tribometer (N)")
 
+    @property
+    def sensor_delay(self) -> float:
+        """Delay of what is sensed (s) at low frequencies: 2 zeta/w0 of the tribometer."""
+        return 2 * self.tribometer_damping / (2 * math.pi * self.tribometer_frequency)
+
     def lag_response(self, frequency: Any, speed: float) -> Any:
         """Friction per steady friction (complex) at `frequency` (Hz), the hold and the sampling included.
 

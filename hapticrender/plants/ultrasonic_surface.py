@@ -28,7 +28,7 @@ from hapticrender.touch.finger import Finger
 MOST_INNER_DELAY = 8  # samples: with a longer delay there is no inner loop
 PACED_DELAY = 3e-3  # s, of pace times the delay and a sample more, where the inner loop takes its share of the phase
 PACED_DELAY_ALONE = 1 / 40  # s, of pace times the delay, where there is none: see `amplitude_model`
-TAPS = 6  # of the inner loop: at 384 kHz three need a drive eight times as noisy for a sixth more of damping
+TAPS = 6  # of the inner loop: fewer make the drive noisier for little more of damping
 DRIVEN = 0.9  # of the drive's limit: what an amplitude may need, as feedback adds to it
 MOST_DETUNING = 0.015  # of the resonance: range of the amplitude loop
 TYPICAL_DETUNING = 1e-3
@@ -112,10 +112,8 @@ class SurfaceParameters(SlidingParameters):
     def amplitude_model(self) -> DeviceModel:
         """Device model of the mode for its amplitude loop, with the range of fingers and temperatures.
 
-        Observer and integral grow with the pace, what they lose by delay with the delay.  With an inner loop the pace
-        leaves 45 degrees of phase, as measured with delays of 1 to 4 samples at 192 and 384 kHz.  Without one (a block
-        device) it leaves a modulus margin of 0.35 (Ms 2.9), the finger estimate being part of the loop: thin; at
-        two thirds of it 400 Hz behind the longest delay of a driver are 0.9 % off in place of 0.2 %.
+        Observer and integral grow with the pace, what they lose by delay with the delay.  Without an inner loop
+        (a block device) the finger estimate is part of the loop and the margin thin; a slower pace follows worse.
         """
         mode = self.carrier_mode
         stiffness, damping = mode.mass * (2 * np.pi * mode.carrier) ** 2, float(mode.damping())
