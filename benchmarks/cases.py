@@ -18,6 +18,7 @@ from benchmarks.numpy_loop import NumpyPlate, NumpyPolar
 from benchmarks.numpy_loop import run as numpy_run
 from benchmarks.peers import BLOCK, ScipyLockIn
 from benchmarks.timing import Figure, compare, cores
+from examples.your_own_driver import MyPlate
 from hapticrender.bands import Bands
 from hapticrender.control.controller import BankController
 from hapticrender.control.demodulator import Demodulator
@@ -134,6 +135,23 @@ def supervision(seconds: float, pairs: int) -> Iterator[Figure]:
                      "the same, not supervised", note)  # fmt: skip
 
 
+def python_driver(seconds: float, pairs: int) -> Iterator[Figure]:
+    """A run on a driver in Python, sample by sample, over the time that its signals last; and the driver alone."""
+    scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=seconds)
+    rendering, drive = hr.prepare(scene, driver=MyPlate()), np.zeros((1, 2))
+
+    def alone() -> None:
+        for _ in range(rendering.samples):
+            rendering.driver.play(drive)
+
+    ours, theirs, _ = compare(partial(hr.run, rendering), alone, pairs)
+    note = (
+        f"{1e6 * ours / rendering.samples:.0f} us a sample, {1e6 * theirs / rendering.samples:.0f} of them its `play`"
+    )
+    yield Figure("driver in Python, a sample a block: time over", ours / seconds, "x", 0.3, 0.6, False,
+                 "that of its signals, 5 kHz", note)  # fmt: skip
+
+
 def paper(pairs: int) -> Iterator[Figure]:
     """The paper's method, 64 bands, times faster than naive C in double; outputs are compared."""
     bands, parameters, samples = comb(64, 1e-6), PlateParameters(), 4096
@@ -232,6 +250,7 @@ def every_case(short: bool) -> dict[str, Callable[[], Iterator[Figure]]]:
     return cases | {
         "waveform": partial(waveform_law, seconds, pairs),
         "supervision": partial(supervision, seconds, 3 * pairs),
+        "driver": partial(python_driver, seconds, pairs),
         "paper": partial(paper, pairs),
         "demodulation": partial(demodulation, 64, pairs),
         "sweep": partial(two_cores, DEVICES, 2.0, 1 if short else 3),
