@@ -136,9 +136,11 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     driver, total = rendering.driver, rendering.samples
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
 
-    def keep(signals: dict[str, Any]) -> None:
-        if len(signals["flags"]):
-            recorder.append(**signals)
+    def keep(*parts: Callable[[], dict[str, Any]]) -> None:
+        with stopped_by_signal(wait=True):  # else what was played since the last call is lost
+            for part in parts:
+                if len((signals := part())["flags"]):
+                    recorder.append(**signals)
 
     device = rendering.device
     with stopped_by_signal(), recorder, ended_with_program() as ending, opened(driver, device):
@@ -148,7 +150,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         try:
             for start in range(0, total, loop.step):
                 loop.advance(start, min(loop.step, total - start))
-                keep(loop.known())
+                keep(loop.known)
                 if loop.faded:
                     break
                 if ending.is_set():
@@ -156,8 +158,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
                 if progress is not None:
                     progress(min(start + loop.step, total) / driver.rate, total / driver.rate)
         finally:
-            keep(loop.known())
-            keep(loop.rest())
+            keep(loop.known, loop.rest)
         if fault := loop.fault():
             fault.recording = recorder.finish()
             raise fault
@@ -315,7 +316,8 @@ class _Loop:
         if self._device_loop is not None:
             self._keep(*self._device_loop(count, self._reference))
             return
-        time, finger, block = self._time(self.step), self.rendering.scene.finger, self.rendering.driver.block
+        finger, block = self.rendering.scene.finger, self.rendering.driver.block
+        time = self._time(-(-count // block) * block)  # whole blocks: a motion may end with the scene
         position, load = finger.position(time), finger.load(time)
         for first in range(0, count, block):
             self._start = start + first
