@@ -217,7 +217,7 @@ class LiveLoop(RealtimeEntry):
             if part is not None:
                 _widen(part, its_model)
         if controller is not self._control.controller:
-            ready(controller, self._arrays["sensed"][-1])
+            ready(controller)
         self.play(texture, controller)
         if rendering.shape is not None and hasattr(self._device, "reshape"):
             self._device.reshape(rendering.shape)

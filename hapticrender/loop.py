@@ -137,8 +137,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     recorder = recorder_of(rendering, journal, requested=rendering.requested)
 
     def keep(*parts: Callable[[], dict[str, Any]]) -> None:
-        """Record signals; one of the system waits meanwhile, as it would cut off what has been played."""
-        with stopped_by_signal(wait=True):
+        with stopped_by_signal(wait=True):  # else what was played since the last call is lost
             for part in parts:
                 if len((signals := part())["flags"]):
                     recorder.append(**signals)
@@ -318,7 +317,7 @@ class _Loop:
             self._keep(*self._device_loop(count, self._reference))
             return
         finger, block = self.rendering.scene.finger, self.rendering.driver.block
-        time = self._time(-(-count // block) * block)
+        time = self._time(-(-count // block) * block)  # whole blocks: a motion may end with the scene
         position, load = finger.position(time), finger.load(time)
         for first in range(0, count, block):
             self._start = start + first

@@ -153,7 +153,7 @@ class Controller(Protocol):
     state: Any
 
     def run(self, sensed: Array, position: Array, waveform: Array) -> tuple[Array, Array, Array]:
-        """Advance by n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,).
+        """Advance by n samples; return drive (n, channels), target envelopes (n, bands) and flags (n,), new arrays.
 
         `waveform` (n,) is the texture's waveform, read only where the bands have no constant envelope.
         """

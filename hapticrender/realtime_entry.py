@@ -23,7 +23,7 @@ import numpy as np
 
 from hapticrender.checks import number, require, scales
 from hapticrender.control.records import CONTROLLER
-from hapticrender.control.state_transfer import drive_limits, state_table
+from hapticrender.control.state_transfer import damper_of, drive_limits, state_table
 from hapticrender.control.supervisor import FADE_OUT
 from hapticrender.jit import CONVERSION, Addressed, CFunction, addresses, record_of
 from hapticrender.protocols import Array, Flag
@@ -68,6 +68,7 @@ class _Control:
             ahead=getattr(controller, "lookahead", 0),
             shared=self.shared,
             limit_at=self.limit,
+            damper=damper_of(controller),
         )
         self.address = int(self.record.ctypes.data)
 

@@ -9,7 +9,7 @@ from numba import carray, types
 
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
-from hapticrender.control.state_transfer import transfer
+from hapticrender.control.state_transfer import settle_damper, transfer
 from hapticrender.jit import CALLBACK, CONVERSION_T, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
 from hapticrender.protocols import Flag
 from hapticrender.sampled_texture import FRESH, TEXTURE_T, evaluate, runs_out, smoothstep, value_at
@@ -32,10 +32,11 @@ SLOT = np.dtype(
 the texture's record; how often it has set the finger, and called."""
 SLOT_T, SLOT_SIZE = numba.from_dtype(SLOT), SLOT.itemsize
 CONTROL = np.dtype(
-    [(name, np.int64) for name in ("step", "state", "signals", "reads_waveform", "ahead", "shared", "limit_at")]
+    [(name, np.int64) for name in "step state signals reads_waveform ahead shared limit_at damper".split()]
 )
 """Addresses that run a controller on the entry's signals; whether it takes a waveform (else a factor), and how far
-ahead; the table of the state that it shares with others (see `control.state_transfer`); the drive's limits."""
+ahead; the table of the state that it shares with others (see `control.state_transfer`); the drive's limits;
+the state of the waveform law, see `settle_damper` there."""
 CONTROL_T = numba.from_dtype(CONTROL)
 
 _ADDRESSES = (
@@ -159,8 +160,10 @@ def take_over(entry):
     e = record(entry, ENTRY_T, 0)
     texture, drive = record(e.current, TEXTURE_T, 0), carray(pointer(e.drive_at, F8), e.block * e.channels)
     bump, flags = carray(pointer(e.bump_at, F8), e.channels), carray(pointer(e.flags_at, I8), e.block)
-    control = record(texture.control, CONTROL_T, 0)
-    transfer(record(e.control, CONTROL_T, 0).shared, control.shared)
+    last, control = record(e.control, CONTROL_T, 0), record(texture.control, CONTROL_T, 0)
+    transfer(last.shared, control.shared)
+    if control.damper != 0 and last.damper == 0:
+        settle_damper(control.damper, e.sensed_at)
     step_controller(entry)
     for m in range(e.block):
         flags[m] &= ~STOPPED  # of this block the next one decides

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from live_devices import Told, slide
+from live_devices import ROUNDING, Told, slide
 from tables import scene_on
 from waves import white
 
@@ -129,6 +129,24 @@ def test_whole_waveforms_and_gratings_change_into_each_other_live(textures):
         wanted, moved = (each[-2500:].std() for each in (recording.reference, recording.motion[:, 0]))
         assert row.error < (0.1 if texture is WHOLE["noise"] else 0.03)
         assert row.achieved / row.target == pytest.approx(moved / wanted, rel=0.1)
+
+
+def test_a_plate_that_comes_in_takes_no_motion_of_before_for_a_step():
+    """A chirp is handed over while noise moves the plate, and comes in 62 ms later, after a tone of the screen alone.
+
+    Its drive is that of a touch under the chirp alone at most, but for rounding; it was 1 A.
+    """
+    largest = []
+    for textures in ([WHOLE["chirp"]], [tone(100.0), WHOLE["noise"], tone(250.0), WHOLE["chirp"]]):
+        with hr.Player("hybrid", paced=False) as player:
+            place = -0.05
+            player.finger(place, 0.05, 0.4)
+            for texture in textures:
+                player.play(texture)
+                place = slide(player, 0.03, start=place)
+            slide(player, 0.2, start=place)
+            largest.append(abs(player._loop.log(1500 if len(textures) > 1 else 0)["drive"][:, :2]).max())
+    assert 0.0 < largest[1] <= largest[0] + 2 * ROUNDING
 
 
 @pytest.mark.parametrize("first", [100.0, 250.0])

@@ -248,3 +248,11 @@ def test_a_host_that_is_late_is_not_taken_for_a_fault_of_the_device(seed):
     wrong.true["gain_1"] = wrong.true["gain_2"] = -1.0
     with pytest.raises(hr.DeviceFault, match=r"\d{3,4} of the \d{4} samples until then were lost, .*; found was: "):
         hr.render(scene, driver=wrong)
+
+
+def test_a_motion_may_end_with_the_last_block():
+    """It is evaluated a piece at once: not beyond the samples that are played, but for the checks' two milliseconds."""
+    places = np.linspace(0.0, 0.01, 1060)
+    motion = type("Ends", (), {"position": lambda self, time: places[np.rint(5000.0 * time).astype(int)]})()
+    scene = hr.Scene(texture=TONE.texture, finger=hr.Finger(motion, 0.3), duration=0.21)
+    assert len(hr.render(scene, driver=StrangersPlate())) == 1050

@@ -14,6 +14,7 @@ from live_devices import RIDGES, TONE
 from test_faults import Logged, scene
 
 import hapticrender as hr
+from hapticrender.analysis.two_touches import TouchWatch
 from hapticrender.latency import measure_latency
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.process_signals import CLOSING, DEFAULT, GUARDED, WAITING, Terminated, _end, stopped_by_signal
@@ -227,3 +228,20 @@ def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, statu
     recording = hr.Recording.load(tmp_path / "out" / "live" / "recording.au")
     assert len(recording) > 0.2 * recording.rate
     assert (tmp_path / "out" / "index.html").exists()
+
+
+def test_a_signal_while_samples_are_recorded_loses_none(defaults, monkeypatch, tmp_path):
+    """They are looked through and recorded 20 ms at once."""
+    update, calls = TouchWatch.update, []
+
+    def struck(watch, signals):
+        calls.append(len(signals["flags"]))
+        strike([signal.SIGINT] if len(calls) == 3 else [])
+        return update(watch, signals)
+
+    monkeypatch.setattr(TouchWatch, "update", struck)
+    driver = Logged(block=25, told=100, delay=100)
+    with pytest.raises(KeyboardInterrupt):
+        hr.render(scene(duration=1.0), driver=driver, journal=tmp_path / "run.au")
+    assert len(hr.Recording.load(tmp_path / "run.au")) == sum(calls) + 1  # zero drive
+    assert calls == [100, 100, 100]

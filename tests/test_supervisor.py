@@ -325,6 +325,15 @@ def test_supervision_does_not_change_a_healthy_run(size):
     np.testing.assert_array_equal(hr.run(rendering).drive, hr.run(bare).drive)
 
 
+def test_a_controller_that_has_run_by_itself_is_supervised():
+    controller = hr.prepare(scene()).controller()
+    gone = np.full((1, 2), np.nan), np.zeros(1), np.zeros(1)
+    controller.controller.run(*gone)
+    for _ in range(100):
+        controller.run(*gone)
+    assert controller.fault is not None
+
+
 MODEL = replace(PlateParameters().device_model(RATE, 1), block=1)
 INVERT, SWAP = np.diag([-1.0, 1.0]), np.eye(2)[::-1]
 

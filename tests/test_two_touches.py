@@ -16,6 +16,7 @@ from hapticrender.analysis.two_touches import (
     measures_moment,
     windows_under_touch,
 )
+from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.touch_panel import PanelReader
 
 LIGHT, HEAVY = (0.2e-3, 1.5, 1e3, 4e-3, 1.0, 200.0), (0.2e-3, 8.0, 8e3, 4e-3, 1.5, 300.0)  # Table 1 of the paper
@@ -166,3 +167,16 @@ def test_devices_without_force_and_moment_are_not_watched():
     assert not measures_moment(model.model)
     with pytest.raises(ValueError, match="1 coordinates: must be a plate with 2"):
         TouchMonitor(model.model)
+
+
+def test_the_length_of_the_pieces_changes_nothing(rng):
+    """A touch near a window's end: the margin after it, of 60 ms, reaches beyond what has come by then."""
+    model, count = PlateParameters().device_model(RATE, 1), 2 * round(RATE)
+    drive, sensed = rng.standard_normal((count, 2)), 1e-6 * rng.standard_normal((count, 2))
+    position, flags, found = np.where(np.arange(count) < 0.24 * RATE, np.nan, 0.01), np.zeros(count, int), []
+    for piece in (1, 100, count):
+        monitor, rows = TouchMonitor(model), [slice(start, start + piece) for start in range(0, count, piece)]
+        found.append(np.concatenate([monitor.update(drive[r], sensed[r], position[r], flags[r]) for r in rows]))
+    assert found[0].any()
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])

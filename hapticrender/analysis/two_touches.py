@@ -103,7 +103,7 @@ class TouchMonitor:
         self._rest: Array | None = None  # force that the free plate leaves at 0 Hz: offsets of the sensors
         self._free: Array | None = None  # last window of the free plate, until no touch is seen to follow
         self._pieces: list[Array] = []
-        self._count = 0
+        self._count = self._skip = 0  # samples in them; how many are to come that are done with
         self.last: TouchTest | None = None
         self.tests = self.detections = 0
         self.two = False
@@ -114,21 +114,24 @@ class TouchMonitor:
         `drive` (n, channels) and `sensed` (n, sensors) are as played and measured, `position` (n,) is that of the
         finger (m, NaN while lifted); windows with samples whose `flags` (n,) are `UNUSABLE` are left out.
         """
-        self._pieces.append(np.column_stack((drive, sensed, position, flags & UNUSABLE)))
-        self._count += len(position)
+        rows = np.column_stack((drive, sensed, position, flags & UNUSABLE))[self._skip :]
+        self._skip -= len(position) - len(rows)
+        self._pieces.append(rows)
+        self._count += len(rows)
         need = self.length + TAPS - 1 + self._late
         raised = np.full(len(position), TWO_TOUCHES * self.two)
         while self._count >= need:
             last = len(position) - 1 - (self._count - need)  # of the window
             rows = np.concatenate(self._pieces)
-            rows = rows[self._take(rows[:need]) :]
-            self._pieces, self._count = [rows], len(rows)
+            done = self._take(rows[:need])
+            self._skip = max(done - len(rows), 0)
+            self._pieces, self._count = [rows[done:]], max(len(rows) - done, 0)
             raised[last:] = TWO_TOUCHES * self.two
         return raised
 
     def restart(self) -> None:
         """Begin a new window: samples are missing here."""
-        self._pieces, self._count, self._free = [], 0, None
+        self._pieces, self._count, self._skip, self._free = [], 0, 0, None
 
     def _take(self, rows: Array) -> int:
         """Test or learn from a window; returns the samples that are done with: up to a while after a change."""

@@ -15,11 +15,11 @@ from hapticrender.control.carriers import FRESH_TIME
 from hapticrender.control.combined import CombinedController
 from hapticrender.control.gain_faults import GAINS
 from hapticrender.control.inverse import WaveformController
-from hapticrender.control.inverse_records import INVERSE, RING
-from hapticrender.control.records import CONTROLLER
+from hapticrender.control.inverse_records import INVERSE, INVERSE_T, RING
+from hapticrender.control.records import CONTROLLER, CONTROLLER_T
 from hapticrender.control.supervisor import SupervisedController
 from hapticrender.control.supervisor_kernel import SUPERVISOR
-from hapticrender.jit import I8, kernel, pointer
+from hapticrender.jit import F8, I8, kernel, pointer, record
 from hapticrender.protocols import Array
 
 PARTS = 2  # of a device
@@ -61,19 +61,40 @@ def state_table(controller: Any) -> Array:
     return np.array(rows + [(0, 0)] * (ROWS - len(rows)), np.int64)
 
 
-def ready(controller: Any, sensed: Array) -> None:
+@kernel
+def settle_damper(controller, sensed):
+    """Let what is `sensed` (an address) be no step to the inner damper of a waveform law that comes in."""
+    c = record(controller, CONTROLLER_T, 0)
+    v, values = record(c.loops_at, INVERSE_T, 0), carray(pointer(sensed, F8), c.p.sensors)
+    for i in range(c.p.coordinates):
+        sag = 0.0
+        for j in range(c.p.sensors):
+            sag += c.p.coordinate_from_sensor[i, j] * values[j]
+        if not abs(sag) <= c.p.sensor_limit:
+            sag = 0.0
+        c.past[i, :] = sag
+        if i == 0:
+            v.slow = sag
+
+
+def damper_of(controller: Any) -> int:
+    """Address of the first part's state, which `settle_damper` takes; 0 where that has no waveform law."""
+    part = _parts(controller)[0]
+    bank = getattr(part, "controller", part)
+    return int(bank.state.ctypes.data) if isinstance(bank, WaveformController) else 0
+
+
+def ready(controller: Any) -> None:
     """Prepare a controller at rest to take over under a finger: its targets are there, and what it has yet to find.
 
-    A part that nothing is transferred to first finds the steady friction, as after a touch.  To the inner damper of a
-    plate what is `sensed` now (sensors,) is no step.
+    A part that nothing is transferred to first finds the steady friction, as after a touch.
     """
     for part in _parts(controller):
         bank = getattr(part, "controller", part)
         if bank is not None:
             bank.tiles["fade"], bank.state["fresh"] = 1.0, FRESH_TIME * bank.rate
         if isinstance(bank, WaveformController):
-            sag = np.nan_to_num(bank.settings["coordinate_from_sensor"][:, : bank.sensors] @ sensed[: bank.sensors])
-            bank.law["fade"], bank.law["slow"], bank.state["past"][0] = 1.0, sag[0], sag[:, None]
+            bank.law["fade"] = 1.0
 
 
 def drive_limits(controller: Any) -> Array:

@@ -185,7 +185,7 @@ class SupervisedController(Addressed):
         self.state["friction"] = 0.0  # what is sensed next may be later than a sample
 
     run = BankController.run
-    _kept: Any = None  # by it; the controller has its own
+    _kept: Any = None  # by it, not by the controller's own
 
 
 def supervised(controller: Controller, model: DeviceModel, *, feedback: bool = True) -> Any:
