@@ -69,8 +69,8 @@ def two_fingers() -> None:
             for how in ("slowed", "not slowed", "no feedback"):
                 plate = TwoFingers(*pair, senses=how != "no feedback")
                 scene = hr.Scene(texture=played, finger=hr.Finger.still(pair[0][1], pair[0][2]), duration=END)
-                keep = TouchWatch._slow_down if how == "slowed" else lambda *_: None
-                with patch.object(TouchWatch, "_slow_down", keep):
+                keep = TouchWatch.slow if how == "slowed" else lambda *_: None
+                with patch.object(TouchWatch, "slow", keep):
                     recording = hr.render(scene, driver=plate)
                 reference = played.waveform(np.arange(len(recording)) / RATE, np.zeros(len(recording)))
                 flagged = np.flatnonzero(recording.flags & hr.Flag.TWO_TOUCHES) / RATE
