@@ -133,6 +133,15 @@ def test_a_killed_process_leaves_all_but_its_last_quarter_second(tmp_path):
     assert loaded.summary()["notes"][0].startswith("the run ended after ")
 
 
+def test_what_is_not_in_the_file_is_a_quarter_second_at_most_with_the_block_that_comes(bands, signals, tmp_path):
+    path, block, left = tmp_path / "run.au", 60, []
+    with make_recorder(path, bands) as recorder:
+        for count in range(block, 2500, block):
+            recorder.append(**{name: values[:block] for name, values in signals.items()})
+            left.append(count - len(Recording.load(path)))
+    assert RATE / 4 - 2 * block < max(left) <= RATE / 4 - block
+
+
 def test_an_older_journal_stays_until_a_run_has_begun(bands, signals, tmp_path):
     path = tmp_path / "run.au"
     with make_recorder(path, bands) as recorder:

@@ -89,7 +89,7 @@ class Recorder:
             signals["reference"] = np.zeros(len(signals["drive"]))
         self._blocks.append(journal.join(self.header, signals))
         self._waiting += len(signals["drive"])
-        if not self._begun or self._waiting >= FLUSH * self.header.rate:
+        if not self._begun or self._waiting + len(signals["drive"]) > FLUSH * self.header.rate:  # with the next block
             self.flush()
 
     def begin(self) -> None:
