@@ -97,6 +97,10 @@ class BoardLine:
         self._textures = 0  # that were sent
         try:
             self.request(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, self._nonce))
+        except DeviceTimeout as error:
+            self.close()
+            cure = f"check that the board runs the firmware of `hapticrender export`, and a UART {baud} baud"
+            raise DeviceTimeout(f"{error}: {cure}") from error
         except DriverError:
             self.close()
             raise

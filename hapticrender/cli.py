@@ -61,7 +61,7 @@ def _whole(least: int, most: int) -> Any:
 
 _METHODS = f"one of {', '.join(defaults.METHODS)} (default: the scene's, or {defaults.METHOD})"
 _METHOD = _option("--method", "NAME", f"control method: {_METHODS}")
-_KINDS = "simulated (default), wavefile:FILE, module:callable or another; see `hapticrender devices`"
+_KINDS = "simulated (default), audio:NAME, serial:PORT, wavefile:FILE, module:callable; see `hapticrender devices`"
 _DRIVER = _option("--driver", "NAME[:ARG]", _KINDS, default="simulated")
 _SEED = _option("--seed", "N", "seed of the noise (default: the scene's)", _whole(0, 10**18 - 1))
 _SCENE = _option("scene", "SCENE", "a TOML file, or the name of a built-in scene")

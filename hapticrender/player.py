@@ -136,13 +136,12 @@ class Player(Addressed):
         with stopped_by_signal(wait=True), noted_on(first), ExitStack() as last:  # last to first, whatever fails
             last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
-            with self._lock:  # a device that is being opened is closed, too; no other is opened
-                self._entered = False
-                last.push(self._stack.pop_all())
-            last.callback(self._stopping.set)
-            last.callback(self._rest, kind is None)
+            last.callback(self._leave, kind is None)
             if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; while it plays
                 compared = self._compare()
+            if kind is not None and self._loop is not None:
+                with suppress(Exception):  # zero drive at once: another thread may be in a long call, such as `state`
+                    self._loop.silence()
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):
@@ -459,6 +458,17 @@ class Player(Addressed):
         if isinstance(fault, WatchdogTimeout):
             fault = WatchdogTimeout(fault.time, self._watchdog or self._timeout)
         self._error = self._error or fault
+
+    def _leave(self, gently: bool) -> None:
+        """Set zero drive and close the device, one that is being opened, too; no other is opened."""
+        with self._lock:
+            self._entered = False
+            stack = self._stack.pop_all()
+        with stack:
+            try:
+                self._rest(gently)
+            finally:
+                self._stopping.set()
 
     def _rest(self, gently: bool) -> None:
         """Set zero drive, after a fade where nothing has failed, and wait until a whole block of it has been played."""

@@ -64,6 +64,10 @@ def test_a_board_plays_live(program, tmp_path):
             player.finger(-0.01, 0.0, 0.4)
             player.sleep(0.5)
             [resting] = player.state().bands
+            player.record(tmp_path / "end.au")
+    end = Recording.load(tmp_path / "end.au")
+    assert len(end) > 0
+    assert not (end.flags & hr.Flag.STOPPED).any()  # it ended well
     assert ridges.frequency == pytest.approx(100.0, rel=0.1)  # a correction of 2 mm is 8 % of a quarter of a second
     assert ridges.target == pytest.approx(4e-6, rel=1e-3)
     assert (resting.frequency, resting.target) == (0.0, 0.0)

@@ -17,6 +17,7 @@ import hapticrender as hr
 import hapticrender.player
 from benchmarks import faults
 from hapticrender.cli import main
+from hapticrender.live_loop import LiveLoop
 from hapticrender.process_signals import Terminated
 from hapticrender.recordings.recording import Recording
 
@@ -285,6 +286,37 @@ def test_what_ends_an_application_ends_in_zero_drive_with_a_flag_within_10_ms(en
         assert len(drive) <= handled[0] + round(0.01 * driver.rate)
     assert recording.flags[-1] == hr.Flag.STOPPED
     assert not recording.drive[-1].any()
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_zero_drive_does_not_wait_for_a_long_call_of_another_thread(end, monkeypatch):
+    """`state`, which takes a second for 512 bands, here 0.5 s as long as it waits; the clock goes on meanwhile."""
+    cause, error = ENDS[end]
+    driver, under_way = OtherPlate(), threading.Event()
+    driver.probe, first = False, 0
+
+    def figures(loop):
+        under_way.set()
+        time.sleep(0.5)
+        return []
+
+    def live(player):
+        nonlocal first
+        player.play(TONE)
+        player.sleep(0.2)
+        monkeypatch.setattr(LiveLoop, "figures", figures)
+        threading.Thread(target=player.state).start()
+        under_way.wait(60.0)
+        first = len(driver.played)
+        cause()
+        player.sleep(10.0)
+
+    with pytest.raises(error), hr.Player(driver=driver) as player:
+        live(player)
+    drive = np.concatenate(driver.played)
+    assert drive[first - 50 : first].any()
+    assert len(drive) > first + 0.4 * driver.rate
+    assert not drive[first + round(0.2 * driver.rate) :].any()  # a busy machine may pause Python for so long
 
 
 def test_a_device_that_does_not_start_is_left_closed():

@@ -13,6 +13,7 @@ import hapticrender as hr
 from benchmarks import faults
 from benchmarks.false_stops import random_scene, run
 from hapticrender.control.gain_faults import WANDER, design_gains
+from hapticrender.control.probe import probe_plate
 from hapticrender.mathx import zoh
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -356,6 +357,7 @@ class Probed(Watched):
         ({"sensors": 10 * np.eye(2)}, "have (9.9|10) times the gain"),
         ({"sensors": 0.1 * np.eye(2)}, "not that of the device model.*scale 0.09"),
         ({"delay": 5}, "delay is 5 samples, not 1"),
+        ({"delay": 21}, "delay is 21 samples, not 1"),
         ({"sensors": 3.0 * np.eye(2)}, "have (2.9|3|3.1) times the gain"),
         ({"spoil": lambda sample, sensed: sensed._replace(sensed=np.full((1, 2), 3e-6))}, "nothing moves"),
         (
@@ -384,6 +386,16 @@ def test_the_probe_refuses_what_is_wired_wrongly(wiring, named, touched):
     assert abs(np.concatenate(plate.played)).max() < 0.05 * 3.0
     assert not plate.is_open
     assert not plate.played[-1].any()
+
+
+@pytest.mark.parametrize("off", [-64, 10, 192])
+@pytest.mark.parametrize("touched", [{}, FINGER], ids=["free", "touched"])
+def test_the_probe_names_a_delay_that_is_off_by_blocks(off, touched):
+    """On a card, whose delay was measured in other blocks; three of 64 once looked like inverted sensors."""
+    plate = Probed(rate=48e3, block=64, told=128, delay=128 + off, **touched)
+    model = replace(PlateParameters(rate=48e3).device_model(48e3, 128), block=64)
+    with pytest.raises(hr.DeviceFault, match=f"the loop's delay is {128 + off} samples, not 128"), plate:
+        probe_plate(plate, model)
 
 
 def test_the_probe_passes_healthy_plates_under_any_finger(rng):

@@ -196,7 +196,9 @@ static void advance_fade(board_t *board)
         board->fade = real_max(board->fade - board->fade_step, board->fade_to);
     }
     if (board->fade_to == REAL(0.0)) {
-        board->flags |= BOARD_STOPPED;
+        if (board->cause != CAUSE_COMMAND && board->cause != CAUSE_DONE) {
+            board->flags |= BOARD_STOPPED;
+        }
         if (board->fade == REAL(0.0)) {
             board->state = BOARD_IDLE;
             textures_init(&board->textures);

@@ -1,10 +1,11 @@
 """Start-up probe: check the wiring of a plate's sensors and actuators before the loop closes.
 
 For 200 ms both actuators play lines of their own, away from the modes, so that a resting finger changes little; the
-surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under 507
-hypotheses h (13 wirings, each with 13 delays, free and with a finger at either sensor) by the residual
-1 - <y, y_h>/(|y| |y_h|), with offset, slope and parabola taken out of each sensor.  The sensors' noise is that of
-second differences in the second half of the silence after it; its energy is none of the response's.
+surface moves by a fortieth of the sensors' range.  The response y is compared with that of the model under at most 516
+hypotheses h (13 wirings, each with 13 delays, that as stated also with 3 about the largest correlation of y with its
+response, free and with a finger at either sensor) by the residual 1 - <y, y_h>/(|y| |y_h|), with offset, slope and
+parabola taken out of each sensor.  The sensors' noise is that of second differences in the second half of the silence
+after it; its energy is none of the response's.
 """
 
 from contextlib import nullcontext
@@ -153,9 +154,11 @@ def _compared(
     residuals, scales, stated, energy = {}, {}, 0.0, float((y**2).sum())
     for load, finger in enumerate((None, *np.linalg.inv(model.coordinate_from_sensed))):
         parts = _responses(model, drive, finger)
+        if finger is None:  # a delay may be off by blocks, which would look like another wiring
+            likely = _likely_delays(y, np.einsum("jjns->ns", parts))
         for name, (sensors, actuators) in WIRINGS.items():
             response = np.einsum("jk,jkns->ns", actuators, parts) @ sensors.T
-            for delay in delays:
+            for delay in {*delays, *(likely if name == "nothing" else ())}:
                 h = _detrended(np.pad(response, ((delay, 0), (0, 0)))[: len(response)])
                 alike, power = float((y * h).sum()), float((h**2).sum())
                 residuals[name, delay, load] = 1.0 - alike / max((energy * power) ** 0.5, 1e-300)
@@ -163,6 +166,14 @@ def _compared(
                 if (name, delay, load) == ("nothing", model.delay - model.block, 0):
                     stated = power
     return residuals, scales, stated
+
+
+def _likely_delays(y: Array, response: Array) -> set[int]:
+    """Shift (samples) of the largest correlation of `y` with a response (n, sensors), and its neighbours."""
+    n = 2 * len(y)
+    spectra = np.fft.rfft(y, n, axis=0) * np.fft.rfft(response, n, axis=0).conj()
+    shift = int(np.argmax(np.fft.irfft(spectra.sum(axis=1), n)[: len(y)]))
+    return {max(shift - 1, 0), shift, shift + 1}
 
 
 def _responses(model: DeviceModel, drive: Array, finger: Array | None = None) -> Array:
