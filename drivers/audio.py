@@ -141,11 +141,13 @@ class AudioDriver(BaseDriver):
     def check_calibrated(self) -> None:
         """Refuse to close a loop whose delay, or displacement at full scale, is unknown, by a DriverError."""
         if self._unknown:
+            name, cure = self._unknown[0], "give it"
+            if name == "delay":
+                cure = f"connect output {self.channels[0]} to input {self.inputs[0]} and measure it with `hapticrender "
+                cure += f"latency --driver {quote(str(self))} --out profile.toml`"
             raise DriverError(
-                f"{self}: {self._unknown[0]} is unknown, so the loop cannot be closed: connect output "
-                f"{self.channels[0]} to input {self.inputs[0]}, measure with `hapticrender latency --driver "
-                f"{quote(str(self))} --out profile.toml`, and give sensed_per_full_scale; or neither, or "
-                "sensed_channels=(), for open loop"
+                f"{self}: {name} is unknown, so the loop cannot be closed: {cure}; or give neither it nor "
+                f"{'sensed_per_full_scale' if name == 'delay' else 'delay'}, or sensed_channels=(), for open loop"
             )
 
     def _open(self) -> None:

@@ -53,6 +53,8 @@ class SerialDriver(BaseDriver):
 
     def __init__(self, port: str, *, finger: Any = None, **options: Any) -> None:
         known = list(inspect.signature(BoardClient).parameters)[1:]
+        if not port:
+            raise ValueError(f"{port=}: must be the name of a serial port, such as serial:/dev/ttyACM0 or serial:COM3")
         for name in options.keys() - known:
             raise TypeError(f"option {name!r} of SerialDriver: must be one of finger, {', '.join(known)}")
         self.client = BoardClient(port, **options)

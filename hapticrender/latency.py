@@ -12,6 +12,7 @@ for in the loop's models a drive is held for a sample, and so acts half a sample
 
 import statistics
 from dataclasses import dataclass, replace
+from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -160,7 +161,8 @@ def find_trip(played: Array, sensed: Array) -> Trip:
     return Trip(shift + float(slope), gain, common / max((powers[0] * powers[1]) ** 0.5, TINY))
 
 
-def write_delay(path: Path, found: Latency) -> None:
-    """Write the delay into the calibration of a profile; a new one is that of a plate."""
-    profile = DeviceProfile.load(path) if path.exists() else DeviceProfile(kind="vt-plate")
+def write_delay(path: Path, found: Latency, tool: str = "") -> None:
+    """Write the delay into the calibration of a profile; a new one is that of a plate, measured with `tool`, today."""
+    new = DeviceProfile(kind="vt-plate", measured_with=tool, measured_on=date.today())
+    profile = DeviceProfile.load(path) if path.exists() else new
     replace(profile, calibration=replace(profile.calibration, delay=round(found.delay, 3))).save(path)

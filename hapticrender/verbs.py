@@ -311,7 +311,9 @@ def latency(arguments: argparse.Namespace) -> int:
         found = measure_latency(driver, runs=arguments.runs, amplitude=arguments.amplitude)
     print(printable(f"{arguments.driver}: {found}"))
     if arguments.out:
-        write_delay(_made(arguments.out), found)
+        setting = f"{found.rate:g} Hz in blocks of {found.block}"
+        tool = f"hapticrender {__version__} latency, driver {arguments.driver}, {setting}"
+        write_delay(_made(arguments.out), found, tool)
         print(f"wrote {arguments.out}")
     return 0
 

@@ -3,6 +3,7 @@
 import ctypes
 import tomllib
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
@@ -192,8 +193,9 @@ def test_block_and_rate_are_options_of_the_text():
     assert (driver.device, driver.block, driver.rate, driver.latency) == ("usb", 256, 44_100, "high")
     assert (driver.channels, driver.inputs, driver.live().delay) == ((3, 4), (1,), 301)
     assert str(driver) == "audio:usb?block=256&rate=44100"
+    late = open_driver("audio:usb?block=256&rate=44100&sensed_per_full_scale=0.001")
     with pytest.raises(DriverError, match=r"`hapticrender latency --driver 'audio:usb\?block=256&rate=44100' --out"):
-        driver.check_calibrated()
+        late.check_calibrated()
     profile = hr.DeviceProfile(kind="vt-plate", calibration={"drive_per_full_scale": 2.0})
     assert open_driver("audio:0?drive_per_full_scale=1.5", profile).drive_limit == 1.5
     for text in ("", "&drive_per_full_scale=3,3,0.01"):
@@ -227,7 +229,8 @@ def test_no_loop_is_closed_with_what_is_unknown(known, unknown):
     chosen = AudioDriver("0", (3, 4), (5, 6), **known)
     cables = {chosen: "3 to input 5", chosen.live(): "3 to input 5", open_driver("audio:0", profile): "1 to input 1"}
     for driver, cable in cables.items():
-        message = f"audio:0: {unknown}.* is unknown.*connect output {cable}.*`hapticrender latency --driver audio:0"
+        cure = f"connect output {cable}.*`hapticrender latency --driver audio:0" if unknown == "delay" else "give it"
+        message = f"audio:0: {unknown}.* is unknown.*: {cure}"
         with pytest.raises(DriverError, match=message):
             driver.open()
         with pytest.raises(DriverError, match=message):  # and before anything is designed for a delay that is none
@@ -351,9 +354,10 @@ def test_a_round_trip_is_found_to_a_fraction_of_a_sample(delay, rng):
 
 def test_the_delay_is_written_into_a_profile(tmp_path):
     found, path = Latency((Trip(272.0, 1.0, 1.0),), 48e3, 64, host_delay=192), tmp_path / "plate.toml"
-    write_delay(path, found)
-    assert tomllib.loads(path.read_text())["calibration"] == {"delay": 143.5}
-    assert tomllib.loads(path.read_text())["profile"] == {"kind": "vt-plate"}
+    write_delay(path, found, "a cable")
+    written = tomllib.loads(path.read_text())
+    origin = {"measured_with": "a cable", "measured_on": date.today()}
+    assert written == {"profile": {"kind": "vt-plate"} | origin, "calibration": {"delay": 143.5}}
     before = """[profile]\nkind = "hybrid"\nname = "my plate"\n[device]\nplate_mass = 0.03
 [calibration]\nsensed_per_full_scale = 1e-3\ndelay = 7\n[limits]\nrms_drive = 1.0\n"""
     path.write_text(before)

@@ -35,6 +35,11 @@ from hapticrender.plants.plate import PlateParameters
 ROUNDING = 2.0**-24  # relative, of float32
 
 
+def test_a_port_without_a_name_is_refused():
+    with pytest.raises(ValueError, match="port='': must be the name of a serial port"):
+        open_driver("serial:")
+
+
 def test_the_board_as_a_process_prints_its_usage():
     found = subprocess.run([program_of("-O2")], capture_output=True, text=True, check=False)
     assert (found.returncode, found.stderr.partition(" [")[0]) == (2, "usage: board LINK")
