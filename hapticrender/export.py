@@ -35,18 +35,20 @@ drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_
 damper_high release
 """.split()
 _LAW = """
-mass damping stiffness lever_per_metre gate_threshold high_pass_pole mean_square_pole filters sensor_filter pole_step
-omega_n pole pole_damping fade_step decay scale_pole noise model_error levelling_pole prior initial_variance
-prior_covariance
+mass damping stiffness lever_per_metre gate_threshold high_pass_smoothing mean_square_smoothing filters
+sensor_filter pole_step omega_n pole pole_damping fade_step decay scale_smoothing noise model_error
+levelling_smoothing prior initial_variance prior_covariance
 """.split()
 _SUPERVISION = """
-invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole ring_corner ring_top_gain
-ring_pole lever danger_motion danger_drive most_motion most_drive large_drive sensed_bound drive_limit heat_pole
-heat_gain slow_pole fade_out fade_now mass damping stiffness bound noise ringing
+invalid_smoothing frozen_drive low high corner top_gain omega energy_smoothing power_smoothing
+drive_smoothing ring_corner ring_top_gain ring_smoothing lever danger_motion danger_drive most_motion most_drive
+large_drive sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing fade_out fade_now
+mass damping stiffness bound noise ringing
 """.split()
 _TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
 _GAINS = """
-scale innovation mean_pole window_pole step_state step_force filter_gain sensor_from_coordinate force_of_actuator
+scale innovation mean_smoothing window_smoothing step_state step_force filter_gain
+sensor_from_coordinate force_of_actuator
 """.split()
 _SAMPLES = "damper_time hold learning_delay relearning_delay initial_end report_delay loss_time".split()
 

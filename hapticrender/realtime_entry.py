@@ -201,7 +201,7 @@ class RealtimeEntry(Addressed):
             "switch": -round(FADE * rate),
             "touch_step": 1.0 / (TOUCH_FADE * rate),
             "closing_step": 1.0 / (FADE_OUT * rate),
-            "gain_pole": -math.expm1(-1.0 / (GAIN_TIME * rate)),
+            "gain_smoothing": -math.expm1(-1.0 / (GAIN_TIME * rate)),
             "offset_kept": math.exp(-1.0 / (JUMP_TIME * rate)),
         }
 

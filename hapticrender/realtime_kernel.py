@@ -48,7 +48,7 @@ _COUNTS = (
 )
 _TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
 _STATE = "gain touch place pace offset offset_input lead lead_input open level"
-_SETTINGS = "rate fade fade_out fade_in touch_step gain_pole offset_kept closing_step"
+_SETTINGS = "rate fade fade_out fade_in touch_step gain_smoothing offset_kept closing_step"
 ENTRY = np.dtype(
     [
         *((name, np.int64) for name in f"{_ADDRESSES} {_COUNTS} {_TEXTURE}".split()),
@@ -234,7 +234,7 @@ def play_texture(entry, slot):
     gains, places = carray(pointer(e.gains_at, F8), (size, 2)), carray(pointer(e.places_at, F8), (2, e.block))
     for m in range(e.block):
         places[0, m], places[1, m] = follow_finger(entry, slot, m)
-        e.gain += e.gain_pole * (s.gain - e.gain)
+        e.gain += e.gain_smoothing * (s.gain - e.gain)
         then = (e.samples + m + e.ahead) % size
         gains[then, 0], gains[then, 1] = e.gain, smoothstep(e.touch)
     if e.current != 0:

@@ -181,8 +181,8 @@ class NaiveError:
         p = self.p
         if not p["detects"]:
             return False, False
-        self.fast = self.fast + p["fast_pole"] * (deviation - self.fast)
-        self.slow = self.slow + p["slow_pole"] * (deviation - self.slow)
+        self.fast = self.fast + p["fast_smoothing"] * (deviation - self.fast)
+        self.slow = self.slow + p["slow_smoothing"] * (deviation - self.slow)
         return (abs(self.fast) ** 2 > p["fast_threshold"]).any(), (abs(self.slow) ** 2 > p["slow_threshold"]).any()
 
     def finger(self):

@@ -124,10 +124,10 @@ class NaiveInverse:
 
     def gate(self, deviation):
         law = self.law
-        self.slow += law["high_pass_pole"] * (deviation - self.slow)
-        self.power += law["mean_square_pole"] * ((deviation - self.slow) ** 2 - self.power)
+        self.slow += law["high_pass_smoothing"] * (deviation - self.slow)
+        self.power += law["mean_square_smoothing"] * ((deviation - self.slow) ** 2 - self.power)
         self.last = np.array([deviation, *self.last[:2]])
-        self.noise += law["mean_square_pole"] * 4 / 300 * ((self.last @ [1, -2, 1]) ** 2 / 6 - self.noise)
+        self.noise += law["mean_square_smoothing"] * 4 / 300 * ((self.last @ [1, -2, 1]) ** 2 / 6 - self.noise)
         large = self.power > np.clip(4 * self.noise, law["gate_threshold"], 25 * law["gate_threshold"])
         if large:
             self.timer = max(self.timer, 1)
@@ -140,7 +140,7 @@ class NaiveInverse:
         psi, dev_u = self.psi[i, :COUNT], self.psi[i, COUNT]
         e = dev - dev_u + psi @ self.theta
         square = dev_u**2 + self.law["deviations"] * dev**2 + self.law["innovations"] * e**2
-        self.size[i] += self.law["mean_square_pole"] * (square - self.size[i])
+        self.size[i] += self.law["mean_square_smoothing"] * (square - self.size[i])
         noise = self.law["noise"][i] + self.law["model_error"] * self.size[i]
         gain = self.P @ psi / (psi @ self.P @ psi + noise)
         self.theta = self.theta - gain * e
@@ -198,7 +198,7 @@ class NaiveInverse:
 
     def levelling_force(self):
         target = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)
-        self.moment += self.law["levelling_pole"] * (target - self.moment)
+        self.moment += self.law["levelling_smoothing"] * (target - self.moment)
         return np.array([0.0, self.moment])
 
     def play(self, force):
@@ -210,8 +210,8 @@ class NaiveInverse:
             self.peak, self.hold_left = min(max(self.peak, needed), 20.0), law["hold"]
         elif self.hold_left < 0:
             self.peak *= law["decay"]
-        self.scale += law["scale_pole"] * (1 / max(self.peak, 1.0) - self.scale)
-        self.smooth += law["scale_pole"] * (self.scale - self.smooth)
+        self.scale += law["scale_smoothing"] * (1 / max(self.peak, 1.0) - self.scale)
+        self.smooth += law["scale_smoothing"] * (self.scale - self.smooth)
         return np.clip(exact, -p["drive_limit"], p["drive_limit"])
 
     def advance(self, n):

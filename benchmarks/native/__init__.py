@@ -98,8 +98,8 @@ class TunedBlock:
     The only place of the benchmarks that reads the internals of a controller: C has to start from the same numbers.
     """
 
-    names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "leak", "ramp", "fast_pole")
-    names += ("slow_pole", "fast_threshold", "slow_threshold", "limit", "sensed_limit", "step")
+    names = ("rate", "block_rate", "g", "dc", "dc_drift", "lead", "integral", "back", "leak", "ramp", "fast_smoothing")
+    names += ("slow_smoothing", "fast_threshold", "slow_threshold", "limit", "sensed_limit", "step")
 
     def __init__(self, controller):
         p, state, tiles = controller.settings, controller.state[0], controller.tiles

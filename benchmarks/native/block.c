@@ -12,7 +12,7 @@ typedef long mask __attribute__((vector_size(64)));
 
 typedef struct {
     double rate, block_rate, g, dc, dc_drift, lead, integral, back, leak, ramp;
-    double fast_pole, slow_pole, fast_threshold, slow_threshold, limit, sensed_limit, step;
+    double fast_smoothing, slow_smoothing, fast_threshold, slow_threshold, limit, sensed_limit, step;
     double listen[2][2], speak[2][2], pattern[2], rounding[2][2];
 } Numbers;
 
@@ -159,8 +159,8 @@ void block_run(v *bands, v *loops, v *laws, v *helds, v *phases, const v *tables
                     own[R_E_RE + r] = e, own[R_V_RE + r] = x;
                     own[R_COMMAND_RE + r] = x + wanted + n->lead * steeper;
                     own[R_SLOPED_RE + r] = slope + steeper;
-                    own[R_FAST_RE + r] += n->fast_pole * (heard - own[R_FAST_RE + r]);
-                    own[R_SLOW_RE + r] += n->slow_pole * (own[R_FAST_RE + r] - own[R_SLOW_RE + r]);
+                    own[R_FAST_RE + r] += n->fast_smoothing * (heard - own[R_FAST_RE + r]);
+                    own[R_SLOW_RE + r] += n->slow_smoothing * (own[R_FAST_RE + r] - own[R_SLOW_RE + r]);
                     fast2 += own[R_FAST_RE + r] * own[R_FAST_RE + r], slow2 += own[R_SLOW_RE + r] * own[R_SLOW_RE + r];
                 }
                 heard_fast += most(fast2 - n->fast_threshold, 0), heard_slow += most(slow2 - n->slow_threshold, 0);

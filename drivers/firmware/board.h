@@ -91,7 +91,7 @@ typedef struct {
     uint32_t commits;                             /* COMMITs executed; the bands in use are `played.bands` */
     uint32_t committed;                           /* 1: this session has set-points */
     real_t gain;
-    real_t peak, rms, heating, heat;              /* A, A, pole a sample, A^2 */
+    real_t peak, rms, heating, heat;              /* A, A, smoothing factor, A^2 */
     real_t displacement;                          /* m: bound of a sensor */
     real_t fade, fade_step, fade_to;
     uint32_t invalid;                             /* samples in a row */

@@ -64,14 +64,14 @@ static void clear_sums(gains_t *s, uint32_t kind)
 static real_t product(const real_t a[2], const real_t b[2]) { return a[0] * b[0] + a[1] * b[1]; }
 
 /* Add a sample of w, each of both sensors, to the sums; those of actuators are means. */
-static void add_sums(gains_t *s, uint32_t kind, real_t pole, const real_t w[GAIN_CHANGES][2])
+static void add_sums(gains_t *s, uint32_t kind, real_t smoothing, const real_t w[GAIN_CHANGES][2])
 {
-    const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - pole);
+    const real_t kept = (kind == SENSOR) ? REAL(1.0) : (REAL(1.0) - smoothing);
     for (uint32_t i = 0u; i < GAIN_CHANGES; i++) {
         for (uint32_t j = i; j < GAIN_CHANGES; j++) {
-            s->weights[kind][i][j] = kept * s->weights[kind][i][j] + pole * product(w[i], w[j]);
+            s->weights[kind][i][j] = kept * s->weights[kind][i][j] + smoothing * product(w[i], w[j]);
         }
-        s->weighted[kind][i] = kept * s->weighted[kind][i] + pole * product(w[i], s->e);
+        s->weighted[kind][i] = kept * s->weighted[kind][i] + smoothing * product(w[i], s->e);
     }
 }
 
@@ -167,7 +167,7 @@ static void follow_actuators(
         }
     }
     if (s->watched > p->duration / 2u) { /* by then w no longer depends on where it began */
-        add_sums(s, ACTUATOR, p->window_pole, (const real_t (*)[2])w);
+        add_sums(s, ACTUATOR, p->window_smoothing, (const real_t (*)[2])w);
     }
     for (uint32_t j = 0u; j < GAIN_CHANGES; j++) {
         const real_t own[2] = {product(p->force_of_actuator[j][0], force), product(p->force_of_actuator[j][1], force)};
@@ -175,7 +175,7 @@ static void follow_actuators(
         advance_model(models[j], p, own);
     }
     if ((2u * s->watched > 3u * p->duration) && (s->energy[ACTUATOR] > LARGE * p->innovation)) {
-        faults->actuators = judge_gains(s, ACTUATOR, p->window_pole * p->innovation, &faults->swapped);
+        faults->actuators = judge_gains(s, ACTUATOR, p->window_smoothing * p->innovation, &faults->swapped);
     }
 }
 
@@ -191,9 +191,9 @@ static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const rea
         s->e[i] = p->scale * sensed[i] - model_sensor(s->models[STATE], p, i);
         const real_t square = s->e[i] * s->e[i];
         jump |= (square > JUMP * ((s->mean[i] > p->innovation) ? s->mean[i] : p->innovation)) ? 1u : 0u;
-        s->mean[i] += p->mean_pole * (square - s->mean[i]);
+        s->mean[i] += p->mean_smoothing * (square - s->mean[i]);
     }
-    s->energy[ACTUATOR] += p->window_pole * (product(s->e, s->e) - s->energy[ACTUATOR]);
+    s->energy[ACTUATOR] += p->window_smoothing * (product(s->e, s->e) - s->energy[ACTUATOR]);
     return jump;
 }
 

@@ -14,9 +14,9 @@
 
 #define GAIN_CHANGES 3u
 
-/* Settings, from `hapticrender export`; poles are per sample. */
+/* Settings, from `hapticrender export`; smoothing factors are per sample. */
 typedef struct {
-    real_t scale, innovation, mean_pole, window_pole; /* 1/m; 1 */
+    real_t scale, innovation, mean_smoothing, window_smoothing; /* 1/m; 1 */
     uint32_t duration;                                /* samples of a trial */
     real_t step_state[4][4], step_force[4][2];        /* of coordinates and their rates, with the force held */
     real_t filter_gain[6][2];                         /* of these and of the force that wanders, per innovation */

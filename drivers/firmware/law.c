@@ -4,7 +4,7 @@
 #include <string.h>
 
 #define REVERSION 20u             /* samples between two steps of the parameters' reversion to their mean */
-#define NOISE_POLE (REAL(4e-3) / REAL(0.3)) /* of the noise at the gate, over that of the mean square over 4 ms */
+#define NOISE_SMOOTHING (REAL(4e-3) / REAL(0.3)) /* of the noise at the gate, over that of the mean square over 4 ms */
 #define MOST_NOISE REAL(25.0)     /* of the stated one, as mean squares */
 #define LARGEST_MOMENT REAL(1.0)  /* N, of the levelling: a hard press may tilt the device */
 #define MOST_NEEDED REAL(20.0)    /* of the drive's limit; a reference that is scaled by more teaches nothing */
@@ -149,13 +149,13 @@ static void find_basis(law_t *law, real_t *rate, real_t *acceleration)
 static uint32_t open_gate(law_t *law, real_t deviation)
 {
     const design_t *d = law->design;
-    law->slow += d->high_pass_pole * (deviation - law->slow);
+    law->slow += d->high_pass_smoothing * (deviation - law->slow);
     const real_t above = deviation - law->slow;
-    law->power += d->mean_square_pole * (above * above - law->power);
+    law->power += d->mean_square_smoothing * (above * above - law->power);
     const real_t *past = law->past[0];
     const real_t second =
         deviation - REAL(2.0) * past[(law->sample - 1u) % LAW_PAST] + past[(law->sample - 2u) % LAW_PAST];
-    law->noise += NOISE_POLE * d->mean_square_pole * (second * second / REAL(6.0) - law->noise);
+    law->noise += NOISE_SMOOTHING * d->mean_square_smoothing * (second * second / REAL(6.0) - law->noise);
     const real_t noise = real_max(d->gate_threshold, real_min(REAL(4.0) * law->noise, MOST_NOISE * d->gate_threshold));
     const uint32_t large = (law->power > noise) ? 1u : 0u;
     const uint32_t opens = ((large != 0u) && (law->fast_open <= REAL(0.0))) ? 1u : 0u;
@@ -239,11 +239,11 @@ static void nominal_force(law_t *law, real_t force[2])
 /* Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it. */
 static void update_powers(law_t *law, real_t nominal, real_t learned)
 {
-    const real_t pole = REAL(1.0) / law->design->rate;
+    const real_t smoothing = REAL(1.0) / law->design->rate;
     const real_t free = (law->learning.contact == 0u) ? REAL(1.0) : REAL(0.0);
-    law->reference_power += pole * (free * law->reference * law->reference - law->reference_power);
-    law->nominal_power += pole * (free * nominal * nominal - law->nominal_power);
-    law->learned_power += pole * (free * learned * learned - law->learned_power);
+    law->reference_power += smoothing * (free * law->reference * law->reference - law->reference_power);
+    law->nominal_power += smoothing * (free * nominal * nominal - law->nominal_power);
+    law->learned_power += smoothing * (free * learned * learned - law->learned_power);
 }
 
 /* Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro. */
@@ -252,7 +252,7 @@ static real_t levelling_force(law_t *law)
     const learning_t *v = &law->learning;
     const real_t moment = v->lever * v->theta[LAW_LOAD] + v->theta[LAW_LOAD + 1];
     const real_t target = (v->contact != 0u) ? real_clip(moment, -LARGEST_MOMENT, LARGEST_MOMENT) : REAL(0.0);
-    law->moment += law->design->levelling_pole * (target - law->moment);
+    law->moment += law->design->levelling_smoothing * (target - law->moment);
     return law->moment;
 }
 
@@ -303,8 +303,8 @@ static void scale_reference(law_t *law, real_t needed)
     } else {
         /* held */
     }
-    law->scale += d->scale_pole * (REAL(1.0) / real_max(law->peak, REAL(1.0)) - law->scale);
-    law->smooth_scale += d->scale_pole * (law->scale - law->smooth_scale);
+    law->scale += d->scale_smoothing * (REAL(1.0) / real_max(law->peak, REAL(1.0)) - law->scale);
+    law->smooth_scale += d->scale_smoothing * (law->scale - law->smooth_scale);
 }
 
 /* Drive of a channel for the forces, rounded and inside the limit; raises `most`, the largest need over the limit. */

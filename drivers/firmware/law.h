@@ -78,18 +78,18 @@ typedef struct {
     real_t taps[2][LAW_DAMPER_TAPS]; /* N/m */
     real_t damper_high;              /* gain while it is open, 1 or 0 */
     real_t release;                  /* fall of the gain a sample */
-    real_t gate_threshold, high_pass_pole, mean_square_pole; /* m^2 that opens it; poles a sample */
+    real_t gate_threshold, high_pass_smoothing, mean_square_smoothing; /* m^2 that opens it; a sample */
     uint32_t damper_time;            /* samples, after a contact */
     /* reference */
     real_t filters[4][LAW_FILTER_TAPS], sensor_filter[LAW_FILTER_TAPS];
     real_t pole_step[2][4];                    /* step of the pair of poles */
     real_t omega_n, pole, pole_damping;        /* w_n (rad/s), w_p (rad/s) and its damping ratio */
     real_t fade_step, change_step, confidence_step; /* a sample: of a start, of a change, of a sensor fault */
-    real_t decay, scale_pole;                  /* of the reference's scale: factor and pole a sample */
+    real_t decay, scale_smoothing;             /* of the reference's scale, a sample */
     uint32_t hold;                             /* samples */
     /* learning */
     uint32_t learning_delay, relearning_delay, initial_end, report_delay, loss_time; /* samples */
-    real_t noise[2], model_error, levelling_pole;         /* m^2; sigma_e^2's share of mean dev_u^2; a sample */
+    real_t noise[2], model_error, levelling_smoothing;    /* m^2; sigma_e^2's share of mean dev_u^2; a sample */
     real_t prior[LAW_PARAMETERS], reversion[LAW_PARAMETERS], initial_variance[4]; /* means; 1 - a_i */
     real_t prior_covariance[LAW_PARAMETERS][LAW_PARAMETERS];
 } design_t;

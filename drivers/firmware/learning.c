@@ -374,7 +374,7 @@ void learning_update(law_t *law, const real_t error[2])
         }
         const real_t innovation = error[c] - explained + dot(states, v->theta, first, end);
         const real_t square = explained * explained + INNOVATIONS * innovation * innovation;
-        v->model_power[c] += d->mean_square_pole * (square - v->model_power[c]);
+        v->model_power[c] += d->mean_square_smoothing * (square - v->model_power[c]);
         const real_t scatter = d->noise[c] + d->model_error * v->model_power[c] + dot(gain[c], states, first, end);
         precision[c] = REAL(1.0) / scatter;
         for (uint32_t i = first; i < end; i++) {

@@ -65,7 +65,7 @@ static supervisor_cause_t cause_of(
 {
     supervisor_cause_t cause = SUPERVISOR_FINE;
     uint32_t sensors = 0u;
-    s->invalid += s->p->invalid_pole * (((invalid != 0u) ? REAL(1.0) : REAL(0.0)) - s->invalid);
+    s->invalid += s->p->invalid_smoothing * (((invalid != 0u) ? REAL(1.0) : REAL(0.0)) - s->invalid);
     if ((broken != 0u) || ((invalid != 0u) && (s->invalid > INVALID_SHARE))) {
         cause = SUPERVISOR_INVALID;
         sensors = invalid;
@@ -148,10 +148,10 @@ static uint32_t check_growth(supervisor_t *s, real_t residual)
     const supervision_t *p = s->p;
     const real_t force = s->filter.value[2];
     const real_t rate = s->filter.rate[0];
-    mean(&s->slow[0], p->slow_pole, -residual * rate);
-    mean(&s->slow[1], p->slow_pole, rate * rate);
-    mean(&s->slow[2], p->slow_pole, force * force);
-    mean(&s->slow[3], p->slow_pole, residual * residual);
+    mean(&s->slow[0], p->slow_smoothing, -residual * rate);
+    mean(&s->slow[1], p->slow_smoothing, rate * rate);
+    mean(&s->slow[2], p->slow_smoothing, force * force);
+    mean(&s->slow[3], p->slow_smoothing, residual * residual);
     const real_t most = SLOW_POWER * SLOW_POWER * s->slow[1] * s->slow[2];
     const uint32_t driven = ((s->slow[0] > REAL(0.0)) && (s->slow[0] * s->slow[0] > most)) ? 1u : 0u;
     const uint32_t is_fault =
@@ -165,18 +165,18 @@ static real_t update_energies(supervisor_t *s, uint32_t i, real_t change)
 {
     const supervision_t *p = s->p;
     const supervisor_filter_t *f = &s->filter;
-    const real_t pole = p->energy_pole;
+    const real_t smoothing = p->energy_smoothing;
     real_t r = f->value[2u + i];
     for (uint32_t j = 0u; j < 2u; j++) {
         r -= p->mass[i][j] * f->change[j] + p->damping[i][j] * f->rate[j] + p->stiffness[i][j] * f->value[j];
     }
-    mean(&s->energy[i], pole, f->value[i] * f->value[i]);
-    mean(&s->energy[2u + i], pole, f->rate[i] * f->rate[i]);
-    mean(&s->energy[4u + i], pole, f->change[i] * f->change[i]);
-    mean(&s->energy[6u + i], pole, change * change);
-    mean(&s->energy[8u + i], pole, f->value[2u + i] * f->value[2u + i]);
-    mean(&s->energy[10u + i], pole, r * r);
-    mean(&s->power[i], p->power_pole, -r * f->rate[i]);
+    mean(&s->energy[i], smoothing, f->value[i] * f->value[i]);
+    mean(&s->energy[2u + i], smoothing, f->rate[i] * f->rate[i]);
+    mean(&s->energy[4u + i], smoothing, f->change[i] * f->change[i]);
+    mean(&s->energy[6u + i], smoothing, change * change);
+    mean(&s->energy[8u + i], smoothing, f->value[2u + i] * f->value[2u + i]);
+    mean(&s->energy[10u + i], smoothing, r * r);
+    mean(&s->power[i], p->power_smoothing, -r * f->rate[i]);
     return r;
 }
 
@@ -239,7 +239,7 @@ static uint32_t check_drive(supervisor_t *s, const real_t drive[])
     s->peak = REAL(0.0);
     for (uint32_t i = 0u; i < LAW_CHANNELS; i++) {
         s->peak = real_max(s->peak, real_abs(drive[i]));
-        mean(&s->drive_energy[i], s->p->drive_pole, drive[i] * drive[i]);
+        mean(&s->drive_energy[i], s->p->drive_smoothing, drive[i] * drive[i]);
         large |= (s->drive_energy[i] > s->p->most_drive) ? 1u : 0u;
     }
     s->drive_count = counted(s->drive_count, large);
@@ -260,7 +260,7 @@ static uint32_t rings(supervisor_t *s, const law_t *law)
             s->filter.ring_band[j] = band + g * top;
             s->filter.ring_level[j] += REAL(2.0) * g * band;
         }
-        mean(&s->ring_energy[i], p->ring_pole, top * top);
+        mean(&s->ring_energy[i], p->ring_smoothing, top * top);
         over |= ((s->ring_energy[i] > p->ringing[i]) && (p->ringing[i] > REAL(0.0))) ? 1u : 0u;
     }
     return over;
@@ -304,7 +304,7 @@ static uint32_t limit_rms_drive(supervisor_t *s, law_t *law, real_t drive[])
     for (uint32_t i = 0u; i < LAW_CHANNELS; i++) {
         flags |= (real_abs(drive[i]) > limit) ? LAW_SATURATED : 0u;
         drive[i] = real_clip(drive[i], -limit, limit);
-        mean(&s->heat[i], s->p->heat_pole, drive[i] * drive[i]);
+        mean(&s->heat[i], s->p->heat_smoothing, drive[i] * drive[i]);
     }
     if (s->p->limited != 0u) {
         law->drive_limit = limit_by_heat(s);
@@ -387,7 +387,7 @@ uint32_t supervisor_step(
         s->fade = real_max(s->fade - s->fade_step, REAL(0.0));
         flags |= SUPERVISOR_STOPPED;
     }
-    if (s->p->heat_pole > REAL(0.0)) {
+    if (s->p->heat_smoothing > REAL(0.0)) {
         flags |= limit_rms_drive(s, law, drive);
     }
     real_t *sent = s->forces[later];

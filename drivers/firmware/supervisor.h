@@ -27,11 +27,11 @@ typedef enum {
     SUPERVISOR_SWAPPED
 } supervisor_cause_t;
 
-/* Settings, from `hapticrender export`; poles and fades are per sample, times in samples. */
+/* Settings, from `hapticrender export`; smoothing factors and fades are per sample, times in samples. */
 typedef struct {
-    real_t invalid_pole, frozen_drive, low, high, corner, top_gain, omega, energy_pole, power_pole, drive_pole;
-    real_t ring_corner, ring_top_gain, ring_pole, lever, danger_motion, danger_drive, most_motion, most_drive;
-    real_t large_drive, sensed_bound, drive_limit, heat_pole, heat_gain, slow_pole, fade_out, fade_now;
+    real_t invalid_smoothing, frozen_drive, low, high, corner, top_gain, omega, energy_smoothing, power_smoothing;
+    real_t drive_smoothing, ring_corner, ring_top_gain, ring_smoothing, lever, danger_motion, danger_drive, most_motion, most_drive;
+    real_t large_drive, sensed_bound, drive_limit, heat_smoothing, heat_gain, slow_smoothing, fade_out, fade_now;
     uint32_t invalid_time, frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time;
     uint32_t ring_stop_time, suspension_time, beyond_time, slow_time;
     uint32_t modelled;  /* 1: motion and drive are compared */

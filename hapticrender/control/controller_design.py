@@ -212,8 +212,8 @@ def _detectors(model: DeviceModel, rules: Rules) -> dict[str, float]:
     period, fast, slow = 1.0 / model.rate, FAST_POLE * model.pace, SLOW_POLE * model.pace
     return {
         "detects": rules.detects,
-        "fast_pole": -math.expm1(-2 * math.pi * fast * period),
-        "slow_pole": -math.expm1(-2 * math.pi * slow * period),
+        "fast_smoothing": -math.expm1(-2 * math.pi * fast * period),
+        "slow_smoothing": -math.expm1(-2 * math.pi * slow * period),
         # square (m2) of so many sigmas of 2 eps e^(-j phi) behind a pole (Hz), eps white of rms `noise` (m)
         "fast_threshold": 2 * math.pi * fast * period * (FAST_SIGMAS * noise) ** 2,
         "slow_threshold": 2 * math.pi * slow * period * (SLOW_SIGMAS * noise) ** 2,
@@ -236,7 +236,7 @@ def _in_blocks(settings: Mapping[str, Any], block: int, rate: float) -> dict[str
     most = ADAPTATION_SHARE * rate / block
     return {
         **settings,
-        **{name: 1.0 - (1.0 - settings[name]) ** block for name in ("fast_pole", "slow_pole")},
+        **{name: 1.0 - (1.0 - settings[name]) ** block for name in ("fast_smoothing", "slow_smoothing")},
         **{name: settings[name] / block for name in ("fast_time", "slow_time")},
         **{name: min(settings[name], most) for name in ("adaptation", "adaptation_high")},
         "block": block,

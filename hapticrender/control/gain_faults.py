@@ -46,7 +46,7 @@ GAINS = np.dtype(
         ("force_of_actuator", np.float64, (CHANGES, 2, 2)),  # F_j per F
         ("scale", np.float64),  # 1/m: e and C are in units of the sensors' noise
         ("innovation", np.float64),  # variance of e of each sensor by noise, as a multiple of its own
-        *((name, np.float64) for name in ("mean_pole", "window_pole")),  # a sample
+        *((name, np.float64) for name in ("mean_smoothing", "window_smoothing")),  # a sample
         ("duration", np.int64),  # samples of a trial
         ("models", np.float64, (2 + 2 * CHANGES, 6)),
         ("w", np.float64, (CHANGES, MOST)),  # of both sensors
@@ -85,7 +85,7 @@ def design_gains(model: DeviceModel, noise: float) -> Array | None:
         swapped = force_map @ np.eye(MOST)[::-1] @ np.linalg.pinv(force_map)
         found["force_of_actuator"][0][SWAP, :n, :n] = swapped - shares.sum(axis=0)
     found["scale"], found["innovation"] = 1.0 / noise, variance
-    found["mean_pole"], found["window_pole"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
+    found["mean_smoothing"], found["window_smoothing"] = (-math.expm1(-1.0 / (t * model.rate)) for t in (MEAN, WINDOW))
     found["duration"] = max(round(TRIAL * model.rate), LEAST_TRIAL)
     return found
 
@@ -143,13 +143,13 @@ def clear_sums(s, kind):
 
 
 @kernel
-def add_sums(s, kind, pole):
-    """Add a sample of w to the sums; with a `pole` below 1 these are means."""
-    w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - pole
+def add_sums(s, kind, smoothing):
+    """Add a sample of w to the sums; with a `smoothing` below 1 these are means."""
+    w, b, x, e, kept = s.weights[kind], s.weighted[kind], s.w, s.e, 1.0 if kind == SENSOR else 1.0 - smoothing
     for i in range(CHANGES):
         for j in range(i, CHANGES):
-            w[i, j] = kept * w[i, j] + pole * (x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1])
-        b[i] = kept * b[i] + pole * (x[i, 0] * e[0] + x[i, 1] * e[1])
+            w[i, j] = kept * w[i, j] + smoothing * (x[i, 0] * x[j, 0] + x[i, 1] * x[j, 1])
+        b[i] = kept * b[i] + smoothing * (x[i, 0] * e[0] + x[i, 1] * e[1])
 
 
 @kernel
@@ -224,13 +224,13 @@ def follow_actuators(s, invalid, force0, force1):
         s.w[j, 0], s.w[j, 1] = model_sensors(s, first + j)
         leave_out(s, j, invalid)
     if s.watched > s.duration // 2:  # by then w no longer depends on where it began
-        add_sums(s, ACTUATOR, s.window_pole)
+        add_sums(s, ACTUATOR, s.window_smoothing)
     for j in range(CHANGES):
         f = s.force_of_actuator[j]
         correct_model(s, first + j, -s.w[j, 0], -s.w[j, 1])
         advance_model(s, first + j, f[0, 0] * force0 + f[0, 1] * force1, f[1, 0] * force0 + f[1, 1] * force1)
     known = 2 * s.watched > 3 * s.duration and s.energy[ACTUATOR] > LARGE * s.innovation
-    return judge_gains(s, ACTUATOR, s.window_pole * s.innovation) if known else (0, False)
+    return judge_gains(s, ACTUATOR, s.window_smoothing * s.innovation) if known else (0, False)
 
 
 @kernel
@@ -245,9 +245,9 @@ def note_innovations(s, sensed, sensors, invalid):
         s.e[i] = s.scale * sensed[i] - (known0 if i == 0 else known1)
         square = s.e[i] * s.e[i]
         jump |= square > JUMP * max(s.innovation, s.mean[i])
-        s.mean[i] += s.mean_pole * (square - s.mean[i])
+        s.mean[i] += s.mean_smoothing * (square - s.mean[i])
         energy += square
-    s.energy[ACTUATOR] += s.window_pole * (energy - s.energy[ACTUATOR])
+    s.energy[ACTUATOR] += s.window_smoothing * (energy - s.energy[ACTUATOR])
     return jump
 
 

@@ -232,7 +232,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
 
 
 def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
-    """Fields of `INVERSE` that are times, in samples, or poles a sample; `noise` (m rms) opens the damper's gate."""
+    """Fields of `INVERSE` that are times, in samples, or smoothing factors; `noise` (m rms) opens the damper's gate."""
     period, friction = 1.0 / model.rate, model.finger.contact is None
     return {
         "learning_delay": round(LEARNING_DELAY * model.rate),
@@ -245,13 +245,13 @@ def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
         "innovations": 0.0 if friction else INNOVATIONS,
         "report_delay": max(round(REPORT_DELAY * model.rate), 1),
         "gate_threshold": (GATE_SIGMAS * noise) ** 2,
-        "high_pass_pole": -math.expm1(-2 * math.pi * 20.0 * period),
-        "mean_square_pole": -math.expm1(-period / 4e-3),
+        "high_pass_smoothing": -math.expm1(-2 * math.pi * 20.0 * period),
+        "mean_square_smoothing": -math.expm1(-period / 4e-3),
         "hold": round(HOLD[friction] * model.rate),
         "decay": math.exp(-period / DECAY[friction]),
-        "scale_pole": period / 2e-3,
-        "power_pole": period / 1.0,
-        "levelling_pole": period / 50e-3 if len(model.mass) > 1 else 0.0,
+        "scale_smoothing": period / 2e-3,
+        "power_smoothing": period / 1.0,
+        "levelling_smoothing": period / 50e-3 if len(model.mass) > 1 else 0.0,
     }
 
 

@@ -51,7 +51,7 @@ REVERSION = 20  # samples between two steps of the parameters' reversion to thei
 LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
 HUGE = 1e6  # drive unit: no drive
-NOISE_POLE = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
+NOISE_SMOOTHING = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
 MOST_NOISE = 25.0  # of the sensors' stated one, as mean squares
 FORCE = Y  # rows of a sample's forces, once its measurements have been read
 SCALED = 0.999  # a reference scaled by less is saturated
@@ -129,11 +129,11 @@ def open_gate(controller, inverse, deviation):
     `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens the gate.
     """
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    v.slow += v.high_pass_pole * (deviation - v.slow)
+    v.slow += v.high_pass_smoothing * (deviation - v.slow)
     above = deviation - v.slow
-    v.power += v.mean_square_pole * (above * above - v.power)
+    v.power += v.mean_square_smoothing * (above * above - v.power)
     second = deviation - 2.0 * c.past[0, (v.sample - 1) & PAST_MASK] + c.past[0, (v.sample - 2) & PAST_MASK]
-    v.sensed_noise += NOISE_POLE * v.mean_square_pole * (second * second / 6.0 - v.sensed_noise)
+    v.sensed_noise += NOISE_SMOOTHING * v.mean_square_smoothing * (second * second / 6.0 - v.sensed_noise)
     noise = max(v.gate_threshold, min(4.0 * v.sensed_noise, MOST_NOISE * v.gate_threshold))
     large, closed = v.power > noise, c.fast_open == 0.0
     if large:
@@ -177,9 +177,9 @@ def update_powers(inverse, nominal, learned):
     """Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it."""
     v = record(inverse, INVERSE_T, 0)
     free = 1.0 - v.contact
-    v.reference_power += v.power_pole * (free * v.reference * v.reference - v.reference_power)
-    v.nominal_power += v.power_pole * (free * nominal * nominal - v.nominal_power)
-    v.learned_power += v.power_pole * (free * learned * learned - v.learned_power)
+    v.reference_power += v.power_smoothing * (free * v.reference * v.reference - v.reference_power)
+    v.nominal_power += v.power_smoothing * (free * nominal * nominal - v.nominal_power)
+    v.learned_power += v.power_smoothing * (free * learned * learned - v.learned_power)
 
 
 @kernel
@@ -187,7 +187,7 @@ def levelling_force(inverse):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
     v = record(inverse, INVERSE_T, 0)
     target = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
-    v.moment += v.levelling_pole * (target - v.moment)
+    v.moment += v.levelling_smoothing * (target - v.moment)
     return v.moment
 
 
@@ -203,8 +203,8 @@ def scale_reference(inverse, needed):
         v.peak, v.hold_left = min(max(v.peak, needed), MOST_NEEDED), v.hold
     elif v.hold_left < 0.0:
         v.peak *= v.decay
-    v.scale += v.scale_pole * (1.0 / max(v.peak, 1.0) - v.scale)
-    v.smooth_scale += v.scale_pole * (v.scale - v.smooth_scale)
+    v.scale += v.scale_smoothing * (1.0 / max(v.peak, 1.0) - v.scale)
+    v.smooth_scale += v.scale_smoothing * (v.scale - v.smooth_scale)
     v.least_scale = min(v.least_scale, v.smooth_scale)
 
 

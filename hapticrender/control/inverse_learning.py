@@ -245,7 +245,7 @@ def learn(inverse, coordinate, error):
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
     square = explained * explained + v.deviations * error * error + v.innovations * innovation * innovation
-    v.model_power[coordinate] += v.mean_square_pole * (square - v.model_power[coordinate])
+    v.model_power[coordinate] += v.mean_square_smoothing * (square - v.model_power[coordinate])
     variance = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
     for i in range(PARAMETERS):
         found = 0.0

@@ -16,8 +16,11 @@ _LAW = "lever_per_metre omega_n pole pole_damping fade_step behind"
 # after a contact, in samples: learning begins, begins again, has no initial motion any more, the damper closes;
 # samples within which a contact is reported; without a position, by which it is lost
 _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"
-# of the damper's gate (m^2; poles a sample), of the reference's scale (samples; poles a sample), of means and levelling
-_POLES = "gate_threshold high_pass_pole mean_square_pole hold decay scale_pole levelling_pole power_pole"
+# of the damper's gate (m^2), of the reference's scale (samples; a factor a sample), and smoothing factors: alpha of
+# mean += alpha (value - mean), a sample
+_SMOOTHING = """
+gate_threshold hold decay high_pass_smoothing mean_square_smoothing scale_smoothing levelling_smoothing power_smoothing
+"""
 # the reference's fade, the drive's largest need and for how long it is held, scale and its least; lever arm, contact,
 # samples since it changed and without a position (`away`; below 0: until the report of a suspected contact is due);
 # the gate's slow part, mean square and noise; r as the sensors should show it; levelling force; mean squares on the
@@ -31,7 +34,7 @@ INVERSE = np.dtype(
     [
         # settings
         *((name, np.int64) for name in ("delay", "spatial", "learns")),
-        *((name, np.float64) for name in f"{_LAW} {_CONTACT} {_POLES}".split()),
+        *((name, np.float64) for name in f"{_LAW} {_CONTACT} {_SMOOTHING}".split()),
         ("filters", np.float64, (4, TAPS)),
         ("sensor_filter", np.float64, (TAPS,)),
         ("sensor_rate_filter", np.float64, (TAPS,)),  # of its derivative, where the sensors are ahead of the contact

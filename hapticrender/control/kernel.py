@@ -216,8 +216,8 @@ def update_envelopes(c, integral, block):
                 found, deviation = samples[Y + i, 0] * carrier, 2.0 * c.deviation[i] * carrier
             if p.detects > 0.0:
                 fast, slow = get(x, "fast"), get(x, "slow")
-                fast = fast + p.fast_pole * (deviation - fast)
-                slow = slow + p.slow_pole * (fast - slow)
+                fast = fast + p.fast_smoothing * (deviation - fast)
+                slow = slow + p.slow_smoothing * (fast - slow)
                 over, above = maximum(square(fast), over), maximum(square(slow), above)
                 put(x, "fast", fast)
                 put(x, "slow", slow)

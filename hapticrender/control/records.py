@@ -81,7 +81,7 @@ rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge
 needs_contact least_speed sensor_delay contact_length corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
 integral integral_medium integral_high damper damper_high
-detects fast_pole slow_pole fast_threshold slow_threshold fast_time slow_time release
+detects fast_smoothing slow_smoothing fast_threshold slow_threshold fast_time slow_time release
 contact_on contact_off contact_damping typical_speed lock
 adaptation adaptation_high rest rest_high age least_motion typical_mass typical_stiffness
 polar clamped subtracted feedback forward deviation dynamic table_step

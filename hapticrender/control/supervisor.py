@@ -244,7 +244,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "most_drive": UNLIMITED,
         "coordinate_from_sensor": padded(model.coordinate_from_sensed, 2, MOST_SENSORS),
         "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
-        "invalid_pole": _pole(INVALID_TIME, rate),
+        "invalid_smoothing": _smoothing(INVALID_TIME, rate),
         "invalid_time": math.ceil(-INVALID_TIME * math.log1p(-INVALID_SHARE) * rate),
         "frozen_time": max(FROZEN_SAMPLES, round(FROZEN_TIME / model.pace * rate)),
         "frozen_drive": UNLIMITED if model.inferred else moved,
@@ -253,14 +253,14 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         **_limit_settings(controller, model),
     }
     if model.contact_damping > 0.0 and model.sensor_delay * rate >= 1.0:  # a sensor behind the contact, with a mass
-        settings |= {"least_friction": FRICTION_SIGMAS * noise, "friction_pole": _pole(FRICTION_TIME, rate)}
+        settings |= {"least_friction": FRICTION_SIGMAS * noise, "friction_smoothing": _smoothing(FRICTION_TIME, rate)}
     if demand is None:
         return settings
     modelled = demand.lowest < rate / 10  # beyond it neither trapezoidal rule nor hold are the device's
     pressed = model.finger.contact is not None
     press, pace = press_drive(model) if pressed else 0.0, min(model.pace, FASTEST_PACE)
     settings |= {
-        "drive_pole": _pole(DRIVE_TIME / pace, rate),
+        "drive_smoothing": _smoothing(DRIVE_TIME / pace, rate),
         "drive_time": PRESS_TIME / pace * rate if pressed else 0.0,  # else no press is there to be waited for
         "most_drive": (1.5 * demand.drive + press / 2.4) ** 2 / 2.0,
     }
@@ -277,12 +277,12 @@ def _limit_settings(controller: Any, model: DeviceModel) -> dict[str, Any]:
     }
     if not model.rms_limit < model.drive_limit:
         return settings
-    pole = _pole(model.rms_time, model.rate)
-    peak = min(model.drive_limit, model.rms_limit / math.sqrt(pole))  # a single sample passes no limit of the heat
+    heating = _smoothing(model.rms_time, model.rate)
+    peak = min(model.drive_limit, model.rms_limit / math.sqrt(heating))  # a single sample passes no limit of the heat
     own = getattr(controller.state, "dtype", None) == CONTROLLER
     return settings | {
         "drive_limit": peak,
-        "heat_pole": pole,
+        "heat_smoothing": heating,
         "heat_gain": (peak / model.rms_limit) ** 2 - 1.0,
         "limited": controller.state.ctypes.data if own else 0,
     }
@@ -314,8 +314,8 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "omega": omega,
         "low": g / (1.0 + g),
         "high": high / (1.0 + high),
-        "energy_pole": _pole(float(np.clip(0.36 / demand.lowest, 5e-3, 10e-3)), rate),
-        "power_pole": _pole(POWER_TIME, rate),
+        "energy_smoothing": _smoothing(float(np.clip(0.36 / demand.lowest, 5e-3, 10e-3)), rate),
+        "power_smoothing": _smoothing(POWER_TIME, rate),
         "bound": bound,
         "noise": floor,
         "inconsistent_time": rate * float(np.clip(1.2 / demand.lowest, 15e-3, 60e-3)),
@@ -323,7 +323,7 @@ def _motion_settings(model: DeviceModel, demand: Demand, noise: float) -> dict[s
         "lever": abs(model.place_from_coordinate[:, 1:]).max(initial=0.0),
         "danger_motion": 4.0 * demand.motion + 1.36 * sag,
         "most_motion": 3.0 * demand.motion + 5.4 * sag,
-        "slow_pole": _pole(SLOW_MEAN, rate),
+        "slow_smoothing": _smoothing(SLOW_MEAN, rate),
         "slow_time": SLOW_TIME * rate,
         "danger_drive": DANGER_DRIVE * model.drive_limit,
     }
@@ -342,7 +342,7 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
         "ringing": RINGING_VARIANCES * state["p"]["damper_noise"][0] ** 2,
         "ring_corner": g,
         "ring_top_gain": 1.0 / (1.0 + g * (g + ROOT2)),
-        "ring_pole": _pole(RINGING_MEAN, rate),
+        "ring_smoothing": _smoothing(RINGING_MEAN, rate),
         "large_drive": 0.6 * model.drive_limit if needs_all else UNLIMITED,
         **{f"{name}_time": time * rate for name, time in times.items()},
     }
@@ -384,6 +384,6 @@ def _trapezoidal(frequency: float, rate: float) -> float:
     return math.tan(math.pi * frequency / rate)
 
 
-def _pole(time: float, rate: float) -> float:
-    """Gain of a one-pole mean over `time` (s)."""
+def _smoothing(time: float, rate: float) -> float:
+    """Smoothing factor (a sample) of a mean over `time` (s)."""
     return -math.expm1(-1.0 / (time * rate))

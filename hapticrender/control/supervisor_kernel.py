@@ -66,10 +66,10 @@ JUMP_SHARE, JUMP_NEIGHBOURS = 0.5, 0.25  # of the friction before; of the jump: 
 JUMP_INVALID = 0.9  # of what one invalid sample, whose value is held, adds to their share: a tenth of its time ago
 
 _SETTINGS = """
-sensor_limit invalid_pole frozen_drive low high corner top_gain omega energy_pole power_pole drive_pole
-ring_corner ring_top_gain ring_pole lever danger_motion danger_drive most_motion most_drive large_drive
-sensed_bound drive_limit heat_pole heat_gain slow_pole
-fade_out fade_now least_friction friction_pole
+sensor_limit invalid_smoothing frozen_drive low high corner top_gain omega energy_smoothing power_smoothing
+drive_smoothing ring_corner ring_top_gain ring_smoothing lever danger_motion danger_drive most_motion most_drive
+large_drive sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing
+fade_out fade_now least_friction friction_smoothing
 """.split()
 _TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
 SETTINGS = np.dtype(
@@ -87,7 +87,7 @@ SETTINGS = np.dtype(
         *((name, np.int64) for name in ("frame", "frame_at")),
     ]
 )
-"""Settings of a supervisor, as `design_supervisor` derives them; poles and fades are per sample, times in samples."""
+"""Settings of a supervisor, as `design_supervisor` derives them: factors and fades per sample, times in samples."""
 COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow")
 SUPERVISOR = np.dtype(
     [
@@ -182,7 +182,7 @@ def check_sensors(supervisor, sensed, n, drive, acts):
         q0 += shows[0, i] * last[i]
         q1 += shows[1, i] * last[i]
     s.input[0], s.input[1] = q0, q1
-    s.invalid += p.invalid_pole * ((1.0 if invalid > 0 else 0.0) - s.invalid)
+    s.invalid += p.invalid_smoothing * ((1.0 if invalid > 0 else 0.0) - s.invalid)
     if is_broken(supervisor, lost) or (invalid > 0 and s.invalid > INVALID_SHARE):
         cause = INVALID
     elif frozen > 0:
@@ -204,8 +204,8 @@ def check_jump(supervisor, slides):
     jump = abs(second - first)
     alone = max(abs(first - before), abs(now - second)) < JUMP_NEIGHBOURS * jump
     steady = mean > p.least_friction and abs(first - mean) < JUMP_SHARE * mean
-    fresh = before != first and s.invalid < JUMP_INVALID * p.invalid_pole  # else a converter may hold its values
-    f[0] = mean + p.friction_pole * (before - mean) if slides else 0.0
+    fresh = before != first and s.invalid < JUMP_INVALID * p.invalid_smoothing  # else a converter may hold its values
+    f[0] = mean + p.friction_smoothing * (before - mean) if slides else 0.0
     f[1], f[2], f[3] = first, second, now
     return steady and fresh and alone and jump > JUMP_SHARE * mean
 
@@ -234,10 +234,10 @@ def check_growth(supervisor, residual):
     """Test 4, slowly: whether heave has been driven on by what the model lacks for long, as no finger does."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, force, rate = s.p, s.value[2], s.rate[0]
-    s.slow[0] += p.slow_pole * (-residual * rate - s.slow[0])
-    s.slow[1] += p.slow_pole * (rate * rate - s.slow[1])
-    s.slow[2] += p.slow_pole * (force * force - s.slow[2])
-    s.slow[3] += p.slow_pole * (residual * residual - s.slow[3])
+    s.slow[0] += p.slow_smoothing * (-residual * rate - s.slow[0])
+    s.slow[1] += p.slow_smoothing * (rate * rate - s.slow[1])
+    s.slow[2] += p.slow_smoothing * (force * force - s.slow[2])
+    s.slow[3] += p.slow_smoothing * (residual * residual - s.slow[3])
     grows = s.slow[0] > 0.0 and s.slow[0] * s.slow[0] > SLOW_POWER * SLOW_POWER * s.slow[1] * s.slow[2]
     grows &= s.slow[3] < BY_DRIVE * s.slow[2] and s.slow[2] > SLOW_FORCE * p.noise[0]
     s.slow_count = s.slow_count + 1 if grows else 0
@@ -264,9 +264,9 @@ def check_motion(supervisor):
             grows = check_growth(supervisor, r)
         step = force - (last0 if i == 0 else last1)
         x[i], x[2 + i], x[4 + i], x[6 + i], x[8 + i], x[10 + i] = q, v, a, step, force, r
-        s.power[i] += p.power_pole * (-r * v - s.power[i])
+        s.power[i] += p.power_smoothing * (-r * v - s.power[i])
     for k in range(12):
-        e[k] += p.energy_pole * (x[k] * x[k] - e[k])
+        e[k] += p.energy_smoothing * (x[k] * x[k] - e[k])
     for i in range(2):
         bound, residual, drive, power = p.noise[i], e[10 + i], e[8 + i], s.power[i]
         for j in range(8):
@@ -314,7 +314,7 @@ def check_drive(supervisor, drive, n):
     for i in range(p.channels):
         value = drive[n, i]
         peak = max(peak, abs(value))
-        s.drive_energy[i] += p.drive_pole * (value * value - s.drive_energy[i])
+        s.drive_energy[i] += p.drive_smoothing * (value * value - s.drive_energy[i])
         large |= s.drive_energy[i] > p.most_drive
     s.drive_count = s.drive_count + 1 if large else 0
     s.peak = peak
@@ -335,7 +335,7 @@ def check_ringing(supervisor):
             top = p.ring_top_gain * (top - s.ring_level[j] - (g + ROOT2) * s.ring_band[j])
             band = s.ring_band[j] + g * top
             s.ring_band[j], s.ring_level[j] = band + g * top, s.ring_level[j] + 2.0 * g * band
-        s.ring_energy[i] += p.ring_pole * (top * top - s.ring_energy[i])
+        s.ring_energy[i] += p.ring_smoothing * (top * top - s.ring_energy[i])
         over |= s.ring_energy[i] > p.ringing[i] > 0.0
     s.ring_wait_count = max(s.ring_wait_count - 1, 0)
     s.ring_count = s.ring_count + 1 if over and s.suspended == 0 and s.ring_wait_count == 0 else 0
@@ -363,7 +363,7 @@ def limit_rms_drive(supervisor, drive, flags, n):
             value = math.copysign(limit, value)
             flags[n] |= SATURATED
         drive[n, i] = value
-        s.heat[i] += p.heat_pole * (value * value - s.heat[i])
+        s.heat[i] += p.heat_smoothing * (value * value - s.heat[i])
         most = max(most, s.heat[i])
     return math.sqrt(max(p.drive_limit * p.drive_limit - p.heat_gain * most, 0.0))
 
@@ -406,7 +406,7 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         s.fade_step = max(s.fade_step, p.fade_now if cause == OVERMOTION else p.fade_out)
         s.fade = max(s.fade - s.fade_step, 0.0)
         flags[n] |= STOPPED
-    if p.heat_pole > 0.0:
+    if p.heat_smoothing > 0.0:
         limit = limit_rms_drive(supervisor, drive, flags, n)
         if p.limited != 0:  # the controller scales its whole envelope into it
             record(p.limited, CONTROLLER_T, 0).p.drive_limit = limit
