@@ -89,7 +89,7 @@ clean: ## remove the environment and everything that was built or written
 .venv-oldest/made.stamp: pyproject.toml
 	@echo "installing $(OLDEST) into .venv-oldest"
 	@"$$(command -v python3.11 || echo "$(PYTHON)")" -m venv .venv-oldest
-	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check $(OLDEST) pytest pytest-timeout hypothesis
+	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check --no-compile $(OLDEST) pytest pytest-timeout hypothesis
 	@touch $@
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml
