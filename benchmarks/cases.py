@@ -243,7 +243,7 @@ def start_up(times: int) -> Iterator[Figure]:
 
 
 def every_case(short: bool) -> dict[str, Callable[[], Iterator[Figure]]]:
-    """All cases by name; short ones for CI, without the start, whose seconds are of no ratio and take as long as all."""
+    """All cases by name; short ones for CI, without the start: its seconds are no ratio, and take as long as all."""
     pairs, seconds = (3, 1.0) if short else (9, 8.0)
     cases = {f"blocks {bands}": partial(blocks, bands, pairs) for bands in (8, 64, 512)}
     cases |= {f"closed loop {what}": partial(closed_loop, what, seconds, pairs) for what in FINGERS}
