@@ -73,7 +73,7 @@ docs: .venv/docs.stamp ## build the API reference from the docstrings into out/a
 	@$(RUN) -W error::UserWarning -W "ignore:Error parsing type annotation" -m pdoc -d numpy -o out/api $(API)
 	@echo "API reference: out/api/index.html"
 
-wheel: .venv/test.stamp ## build the wheel, install it into an empty environment and run the demo there
+wheel: .venv/test.stamp ## build the wheel, install it into an empty environment and render a scene there
 	@.ci/wheel
 
 clean: ## remove the environment and everything that was built or written
