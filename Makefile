@@ -73,7 +73,7 @@ docs: .venv/docs.stamp ## build the API reference from the docstrings into out/a
 	@$(RUN) -W error::UserWarning -W "ignore:Error parsing type annotation" -m pdoc -d numpy -o out/api $(API)
 	@echo "API reference: out/api/index.html"
 
-wheel: .venv/test.stamp ## build the wheel, install it into an empty environment and run the demo there
+wheel: .venv/test.stamp ## build the wheel, install it into an empty environment and render a scene there
 	@.ci/wheel
 
 clean: ## remove the environment and everything that was built or written
@@ -89,7 +89,7 @@ clean: ## remove the environment and everything that was built or written
 .venv-oldest/made.stamp: pyproject.toml
 	@echo "installing $(OLDEST) into .venv-oldest"
 	@"$$(command -v python3.11 || echo "$(PYTHON)")" -m venv .venv-oldest
-	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check $(OLDEST) pytest pytest-timeout hypothesis
+	@.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check --no-compile $(OLDEST) pytest pytest-timeout hypothesis
 	@touch $@
 
 .venv/demo.stamp: .venv/made.stamp pyproject.toml

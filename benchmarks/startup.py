@@ -27,17 +27,15 @@ def _spent(code: str, cache: str | None = None) -> float:
     return float(found.stdout)
 
 
-def measure(times: int, touched: bool) -> Iterator[tuple[str, float, float, float, str]]:
-    """Name, seconds (median), target and bound of each, and a note; `touched` adds a scene under a finger to it."""
+def measure(times: int) -> Iterator[tuple[str, float, float, float, str]]:
+    """Name, seconds (median), target and bound of each, and a note with a scene under a finger."""
     rows = []
     for _ in range(times):
         with tempfile.TemporaryDirectory() as cache:
             rows.append((_spent(IMPORT), _spent(FIRST, cache), _spent(FIRST, cache)))
     imported, cold, warm = (statistics.median(column) for column in zip(*rows, strict=True))
-    note = ""
-    if touched:
-        with tempfile.TemporaryDirectory() as cache:
-            note = f"{_spent(TOUCHED, cache):.2f} s for a second under a sliding finger"
+    with tempfile.TemporaryDirectory() as cache:
+        note = f"{_spent(TOUCHED, cache):.2f} s for a second under a sliding finger"
     yield "import, over numpy's", imported, 0.1, 0.25, ""
     yield "first sample, caches warm", warm, 0.8, 0.8, ""
     yield "first sample, caches cold", cold, 3.0, 6.0, note

@@ -342,11 +342,11 @@ def test_the_accuracy_suite_plays_chosen_cases_on_a_plate_of_the_users(run, tmp_
     """Its callable gets parameters and a finger; one that takes neither is named."""
     report = tmp_path / "a.json"
     suite = ("validate", "--suite", "accuracy", "--driver")
-    status, out, _ = run(*suite, "hapticrender.accuracy.plate:SimulatedPlate", "modul", "late", "--json", report)
+    status, out, _ = run(*suite, "hapticrender.accuracy.plate:SimulatedPlate", "modul", "--json", report)
     assert status == 0
     assert "MISSED" not in out
     figures = json.loads(report.read_text(encoding="utf-8"))["figures"]
-    assert [each["case"] for each in figures] == ["modulation", "late"]
+    assert [each["case"] for each in figures] == ["modulation"]
     status, _, errors = run(*suite, PLATE, "modulation", "overload")
     assert (status, "overload" in errors[-1]) == (2, True), "it plays on a plate of its own"
     status, _, errors = run(*suite, PLATE, "white")

@@ -162,7 +162,7 @@ def friction_errors(device, recording, speed, load):
 
 @pytest.mark.parametrize(
     ("speed", "load", "block"),
-    [(0.04, 0.25, 16), (0.08, 0.4, 16), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 8), (0.12, 1.0, 16)],
+    [(0.04, 0.25, 16), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 16)],
 )
 def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, load, block):
     """As identified.  Where its force per volt, 10 % less than by the design, is not, the error is larger."""
