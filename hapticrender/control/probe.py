@@ -10,6 +10,7 @@ after it; its energy is none of the response's.
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -194,8 +195,14 @@ def _responses(model: DeviceModel, drive: Array, finger: Array | None = None) ->
 
 def _detrended(values: Array) -> Array:
     """Take offset, slope and parabola out of each column."""
-    basis = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, len(values)), 3))[0]
+    basis = _parabolas(len(values))
     return np.asarray(values - basis @ (basis.T @ values))
+
+
+@lru_cache(maxsize=4)
+def _parabolas(n: int) -> Array:
+    """Orthonormal basis (n, 3) of offset, slope and parabola."""
+    return np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, n), 3))[0]
 
 
 def play_probe(driver: Driver, drive: Array, places: int, rest: float) -> tuple[Array, float]:
