@@ -141,13 +141,15 @@ class AudioDriver(BaseDriver):
     def check_calibrated(self) -> None:
         """Refuse to close a loop whose delay, or displacement at full scale, is unknown, by a DriverError."""
         if self._unknown:
-            name, cure = self._unknown[0], "give it"
-            if name == "delay":
+            cure = "give it"
+            if self._unknown[0] == "delay":
                 cure = f"connect output {self.channels[0]} to input {self.inputs[0]} and measure it with `hapticrender "
                 cure += f"latency --driver {quote(str(self))} --out profile.toml`"
+                cure += ", and give sensed_per_full_scale" if len(self._unknown) > 1 else ""
+            names = " and ".join(self._unknown)
             raise DriverError(
-                f"{self}: {name} is unknown, so the loop cannot be closed: {cure}; or give neither it nor "
-                f"{'sensed_per_full_scale' if name == 'delay' else 'delay'}, or sensed_channels=(), for open loop"
+                f"{self}: {names} is unknown, so the loop cannot be closed: {cure}; or give neither delay "
+                "nor sensed_per_full_scale nor sensed_channels, for open loop"
             )
 
     def _open(self) -> None:

@@ -99,7 +99,7 @@ class BoardLine:
             self.request(Kind.HELLO, protocol.pack(Kind.HELLO, protocol.VERSION, self._nonce))
         except DeviceTimeout as error:
             self.close()
-            cure = f"check that the board runs the firmware of `hapticrender export`, and a UART {baud} baud"
+            cure = f"check that the board runs the firmware of `hapticrender export`, its UART at {baud} baud"
             raise DeviceTimeout(f"{error}: {cure}") from error
         except DriverError:
             self.close()

@@ -162,7 +162,11 @@ def find_trip(played: Array, sensed: Array) -> Trip:
 
 
 def write_delay(path: Path, found: Latency, tool: str = "") -> None:
-    """Write the delay into the calibration of a profile; a new one is that of a plate, measured with `tool`, today."""
-    new = DeviceProfile(kind="vt-plate", measured_with=tool, measured_on=date.today())
-    profile = DeviceProfile.load(path) if path.exists() else new
-    replace(profile, calibration=replace(profile.calibration, delay=round(found.delay, 3))).save(path)
+    """Write the delay into the calibration of a profile; a new one is that of a plate.
+
+    One without parameters of the device says that it was measured with `tool` (200 characters of it), today.
+    """
+    profile = DeviceProfile.load(path) if path.exists() else DeviceProfile(kind="vt-plate")
+    origin: Any = {} if profile.device else {"measured_with": tool[:200], "measured_on": date.today()}
+    calibration = replace(profile.calibration, delay=round(found.delay, 3))
+    replace(profile, calibration=calibration, **origin).save(path)

@@ -137,11 +137,11 @@ class Player(Addressed):
             last.callback(atexit.unregister, self.__exit__)
             last.callback(self._close_recorder, kind is not None or self._error is not None)
             last.callback(self._leave, kind is None)
-            if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; while it plays
-                compared = self._compare()
             if kind is not None and self._loop is not None:
                 with suppress(Exception):  # zero drive at once: another thread may be in a long call, such as `state`
                     self._loop.silence()
+            if not isinstance(self._error or error, Exception):  # which Ctrl-C is not; before the device is closed
+                compared = self._compare()
         if kind is None and self._error is not None and not self._raised:
             raise self._error
         if kind is None and self._error is None and (slow := getattr(self._loop, "slow", "")):

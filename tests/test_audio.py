@@ -193,6 +193,8 @@ def test_block_and_rate_are_options_of_the_text():
     assert (driver.device, driver.block, driver.rate, driver.latency) == ("usb", 256, 44_100, "high")
     assert (driver.channels, driver.inputs, driver.live().delay) == ((3, 4), (1,), 301)
     assert str(driver) == "audio:usb?block=256&rate=44100"
+    with pytest.raises(DriverError, match="delay and sensed_per_full_scale.*, and give sensed_per_full_scale; or"):
+        AudioDriver("0", (1, 2), (1, 2)).check_calibrated()
     late = open_driver("audio:usb?block=256&rate=44100&sensed_per_full_scale=0.001")
     with pytest.raises(DriverError, match=r"`hapticrender latency --driver 'audio:usb\?block=256&rate=44100' --out"):
         late.check_calibrated()
@@ -354,10 +356,12 @@ def test_a_round_trip_is_found_to_a_fraction_of_a_sample(delay, rng):
 
 def test_the_delay_is_written_into_a_profile(tmp_path):
     found, path = Latency((Trip(272.0, 1.0, 1.0),), 48e3, 64, host_delay=192), tmp_path / "plate.toml"
-    write_delay(path, found, "a cable")
-    written = tomllib.loads(path.read_text())
-    origin = {"measured_with": "a cable", "measured_on": date.today()}
-    assert written == {"profile": {"kind": "vt-plate"} | origin, "calibration": {"delay": 143.5}}
+    for tool in ("a cable", 300 * "b"):  # the second replaces the first, as its delay does
+        write_delay(path, found, tool)
+        written = tomllib.loads(path.read_text())
+        head = {"kind": "vt-plate", "measured_with": tool[:200], "measured_on": date.today()}
+        assert written["calibration"] == {"delay": 143.5}
+        assert written["profile"] | {"name": ""} == head | {"name": ""}
     before = """[profile]\nkind = "hybrid"\nname = "my plate"\n[device]\nplate_mass = 0.03
 [calibration]\nsensed_per_full_scale = 1e-3\ndelay = 7\n[limits]\nrms_drive = 1.0\n"""
     path.write_text(before)

@@ -48,13 +48,6 @@ def outputs(folder, gain=1.0, name="grating", notes=(), toml='name = "grating"\n
     return {folder / name: summary}
 
 
-@pytest.mark.parametrize(("source", "models"), [("true", True), ("sensors", False), ("unknown", False)])
-def test_what_a_device_played_did_not_run_on_a_model(tmp_path, source, models):
-    [(folder, summary)] = outputs(tmp_path).items()
-    path = write_page(tmp_path, {folder: summary | {"motion_source": source}})
-    assert ("in closed loop on models of the devices" in path.read_text(encoding="utf-8").replace("\n", " ")) == models
-
-
 def test_the_page_needs_nothing_but_the_files_beside_it(tmp_path):
     scenes = outputs(tmp_path, 1.0, "good one") | outputs(tmp_path, [[5.0], [1.0], [1.0]], "bad")
     for folder in scenes:

@@ -157,9 +157,12 @@ def test_the_board_stops_when_the_application_is_silent(program, tmp_path):
         driver = SerialDriver(str(board.port), clock=SlowClock())
         with hr.Player(driver=driver, watchdog=0.1) as player:
             player.play(TONE)
+            player.record(tmp_path / "silent.au")
             player.sleep(0.05)
             assert player.state().flags == hr.Flag(0)
             driver.client.clock.sleep(0.3)
             with pytest.raises(hr.WatchdogTimeout, match="no method of the player was called"):
                 player.state()
         assert [line[2:] for line in board.log() if line[1] == "state"][-2:] == [["1", "0"], ["0", "7"]]
+    flags = Recording.load(tmp_path / "silent.au").flags
+    assert (flags[:-1] & hr.Flag.STOPPED).any()  # of the board's fade; the last sample is the player's own

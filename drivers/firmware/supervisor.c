@@ -140,7 +140,7 @@ static void filter_signals(supervisor_t *s)
     }
 }
 
-static void mean(real_t *value, real_t pole, real_t sample) { *value += pole * (sample - *value); }
+static void mean(real_t *value, real_t smoothing, real_t sample) { *value += smoothing * (sample - *value); }
 
 /* Test 4, slowly: whether heave has been driven on by what the model lacks for long, as no finger does. */
 static uint32_t check_growth(supervisor_t *s, real_t residual)

@@ -18,7 +18,7 @@ _LAW = "lever_per_metre omega_n pole pole_damping fade_step behind"
 _CONTACT = "learning_delay relearning_delay initial_end damper_time report_delay loss_time"
 # of the damper's gate (m^2), of the reference's scale (samples; a factor a sample), and smoothing factors: alpha of
 # mean += alpha (value - mean), a sample
-_SMOOTHING = """
+_MEANS = """
 gate_threshold hold decay high_pass_smoothing mean_square_smoothing scale_smoothing levelling_smoothing power_smoothing
 """
 # the reference's fade, the drive's largest need and for how long it is held, scale and its least; lever arm, contact,
@@ -34,7 +34,7 @@ INVERSE = np.dtype(
     [
         # settings
         *((name, np.int64) for name in ("delay", "spatial", "learns")),
-        *((name, np.float64) for name in f"{_LAW} {_CONTACT} {_SMOOTHING}".split()),
+        *((name, np.float64) for name in f"{_LAW} {_CONTACT} {_MEANS}".split()),
         ("filters", np.float64, (4, TAPS)),
         ("sensor_filter", np.float64, (TAPS,)),
         ("sensor_rate_filter", np.float64, (TAPS,)),  # of its derivative, where the sensors are ahead of the contact

@@ -173,7 +173,7 @@ def _likely_delays(y: Array, response: Array) -> set[int]:
     """Shift (samples) of the largest correlation of `y` with a response (n, sensors), and its neighbours."""
     n = 2 * len(y)
     spectra = np.fft.rfft(y, n, axis=0) * np.fft.rfft(response, n, axis=0).conj()
-    shift = int(np.argmax(np.fft.irfft(spectra.sum(axis=1), n)[: len(y)]))
+    shift = int(np.argmax(np.fft.irfft(spectra.sum(axis=1), n)[: len(y) // 2]))
     return {max(shift - 1, 0), shift, shift + 1}
 
 

