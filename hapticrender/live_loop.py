@@ -25,7 +25,7 @@ from hapticrender.loop import (
     motion_source,
     stops_itself,
 )
-from hapticrender.protocols import Array, Controller, Flag, Rendering
+from hapticrender.protocols import Array, Controller, Flag, Rendering, Sensed
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
 from hapticrender.sampled_texture import FADE, EvaluatedTexture, ForeseenTexture, SampledTexture
@@ -34,6 +34,7 @@ from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
+TURN = 2e-3  # s: a simulated device held to the clock is played for so long at once
 PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
 REFRESH = 0.02  # s: after which a texture in time and place is evaluated again while its finger goes on as it did
 CHANGES = "current", "previous", "finger_changes"  # of an entry: after which it is evaluated at once
@@ -93,11 +94,15 @@ class LiveLoop(RealtimeEntry):
         own, frames = live_controller(rendering), rendering.driver.block
         ahead = lookahead(rendering.model) if isinstance(rendering.model, CombinedModel) else 0  # of whole waveforms
         super().__init__(own, frames=frames, ahead=ahead, converter=converter, **scales)
-        _ = self.address if scales else self.plain_address  # compiled before anything is live
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         self._calls_back = bool(scales)
+        offered = None if rendering.plant is None else getattr(self.driver, "device_loop", None)
+        self._closed = None if offered is None else offered(self)  # a simulated device's loop in compiled code
+        called = self.plain_address if self._closed is None else self.step.address
+        _ = self.address if scales else called  # compiled before anything is live
         rows = len(self._arrays["log"])
         self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where stated
+        self._known = 0  # samples that have been played, and whose motion is known
         self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
         self._itself = False  # whether it has stopped itself
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
@@ -113,32 +118,53 @@ class LiveLoop(RealtimeEntry):
         self.play(self._texture(rendering))
 
     @property
+    def samples(self) -> int:
+        """Samples that have been played; those of a driver that does not call back with what it has stated of them."""
+        return super().samples if self._calls_back else self._known
+
+    @property
     def flags(self) -> Flag:
         """Everything that was ever raised."""
         return super().flags | self._touches.flags
 
-    def advance(self, sensing: bool, late: bool = False) -> None:
+    def advance(self, sensing: bool, late: bool = False, most: int = 0) -> int:
         """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one.
 
-        `late`: the device was left behind by the clock before it.
+        `late`: the device was left behind by the clock before it.  A simulated device in compiled code plays `most`
+        samples, up to `PIECE`, or `TURN`.  Returns how many were played.
         """
-        places, stated = len(self.model.places), self._has_motion
-        if hasattr(self.driver, "resting"):
-            self.driver.resting = self.stopped is not None or not self._slot["playing"][0]
-        sensed = check_sensed(self.driver, self.driver.play(self._drive), places, stated)
-        at = (self.samples + np.arange(self.driver.block)) % len(self._true)
+        first, flags = self.samples, Flag.OVERRUN if late else 0
+        if self._closed is None:
+            sensed = self._exchange(sensing, flags)
+        else:
+            count = min(most or round(TURN * self.rate), round(PIECE * self.rate))
+            self._entry["given"], self._entry["lost"] = sensing, flags
+            count = 1 if self._reshaping is not self._reshaped else max(count, 1)
+            sensed = self._closed(count, lambda position: np.zeros(len(position)))[-1]
+        at = (first + np.arange(len(sensed.sensed))) % len(self._true)
         if sensed.motion is not None:
             self._true[at, :-1], self._has_motion = sensed.motion, True
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
         self.senses, self._itself = sensed.position is not None, self._itself or stops_itself(sensed, self.running)
-        flags = (Flag.OVERRUN if late else 0) | (0 if sensed.flags is None else int(np.bitwise_or.reduce(sensed.flags)))
-        self._touches.slow()
         self._reshape()
-        self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
         for texture in self._textures:
             if isinstance(texture, EvaluatedTexture) and texture.error is not None:
                 raise texture.error
+        self._known = first + len(at)
+        return len(at)
+
+    def _exchange(self, sensing: bool, flags: int) -> Sensed:
+        """Play a block, and compute the drive of the next one from what was sensed."""
+        if hasattr(self.driver, "resting"):
+            self.driver.resting = self.stopped is not None or not self._slot["playing"][0]
+        places = len(self.model.places)
+        sensed = check_sensed(self.driver, self.driver.play(self._drive), places, self._has_motion)
+        if sensed.flags is not None:
+            flags |= int(np.bitwise_or.reduce(sensed.flags))
+        self._touches.slow()
+        self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
+        return sensed
 
     def fill_some(self) -> None:
         """As `fill`, for `SPELL` at most; what is past by then is left out."""

@@ -51,7 +51,7 @@ class LiveThreads:
             raise DriverError(f"{device}: {trouble}: switch the device off")
 
 
-def hold_to_clock(loop: LiveLoop, play: Callable[[bool], None], stopping: threading.Event) -> None:
+def hold_to_clock(loop: LiveLoop, play: Callable[[bool], object], stopping: threading.Event) -> None:
     """Play block after block, no faster than the clock; one that was left behind by `LATE` starts anew.
 
     `play` is then called with True: a real device has lost samples, and a simulation is slower than the clock.  A real

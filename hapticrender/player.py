@@ -396,15 +396,16 @@ class Player(Addressed):
 
         self._stack.callback(self._threads.end, self._threads.start(target, failed), device, self._timeout, busy or str)
 
-    def _block(self, late: bool = False) -> None:
-        """Play a block; `late`: the device lost samples before it."""
-        self._loop.advance(self._given or self._finger is None, late)
+    def _block(self, late: bool = False, most: int = 0) -> int:
+        """Play a block, see `LiveLoop.advance`."""
+        return self._loop.advance(self._given or self._finger is None, late, most)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
         loop = self._loop
-        for _ in range(max(round(seconds * loop.driver.rate / loop.driver.block), 1)):
-            self._block()
+        left = max(round(seconds * loop.driver.rate / loop.driver.block), 1) * loop.driver.block
+        while left > 0:
+            left -= self._block(most=left)
         with self._lock:
             self._watch()
             self._go_on()

@@ -38,6 +38,7 @@ from hapticrender.realtime_kernel import (
     PLAIN,
     SLOT,
     WORDS,
+    advance_simulated,
     foresee,
 )
 from hapticrender.sampled_texture import FADE, SLOTS, EvaluatedTexture, SampledTexture, publish
@@ -106,6 +107,8 @@ class RealtimeEntry(Addressed):
         A scale is out of its bound, or `frames` is no multiple of the block.
     """
 
+    step, n_bands = advance_simulated, 0  # with `state` and `block` a controller, for a plant's closed loop
+
     def __init__(
         self,
         controller: Any,
@@ -149,7 +152,7 @@ class RealtimeEntry(Addressed):
         fields = {f"{name}_at": array for name, array in {**self._arrays, "slots": self._slots}.items()} | self._start()
         fields |= {"control": self._control.address, "tracker": self._tracker} | self._converted()
         self._entry = record_of(ENTRY, **fields)
-        self.user_data = int(self._entry.ctypes.data)
+        self.user_data, self.state = int(self._entry.ctypes.data), self._entry
         self._arrays["copies"][:] = np.concatenate([self._entry.view(np.int64), self._slot.view(np.int64)])
 
     def _buffers(self) -> dict[str, Array]:

@@ -10,7 +10,21 @@ from numba import carray, types
 from hapticrender.control.carriers import track_finger
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.control.state_transfer import settle_damper, transfer
-from hapticrender.jit import CALLBACK, CONVERSION_T, F8, I8, CFunction, call, entry, kernel, pointer, record, swap
+from hapticrender.jit import (
+    CALLBACK,
+    CONVERSION_T,
+    F8,
+    I8,
+    SIGNALS_T,
+    CFunction,
+    call,
+    entry,
+    kernel,
+    pointer,
+    record,
+    step,
+    swap,
+)
 from hapticrender.protocols import Flag
 from hapticrender.sampled_texture import FRESH, TEXTURE_T, evaluate, runs_out, smoothstep, value_at
 
@@ -418,6 +432,18 @@ def _audio(sensed, drive, frames, time, status, entry):
     if status & LOST:
         e.lost = OVERRUN
     return ABORT if carry(entry, sensed, drive, frames, F4, True) < 0 else CONTINUE
+
+
+@step
+def advance_simulated(entry, signals, first, n):
+    """Advance in the closed loop of a simulated device, whose own finger is used where `given` is not 0."""
+    e, s = record(entry, ENTRY_T, 0), record(signals, SIGNALS_T, 0)
+    flags = carray(pointer(s.flags, I8), first + n)
+    for m in range(first, first + n):
+        e.lost |= flags[m]
+    e.given, e.taken = s.position if e.given != 0 else 0, first
+    sensed, drive = s.sensed + 8 * first * e.sensors, s.drive + 8 * first * e.channels
+    return carry(entry, sensed, drive, n, F8, False)
 
 
 PLAIN = CFunction(_plain, types.int32(I8, I8, types.uint64, I8))

@@ -11,6 +11,7 @@ from test_two_touches import HEAVY
 
 import hapticrender as hr
 from hapticrender.driver_checks import OPEN
+from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.recordings.recording import Recording
 from hapticrender.sampled_texture import FADE
@@ -140,16 +141,24 @@ def test_a_recording_has_the_drive_that_was_handed_over_with_each_block(method, 
     assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
 
 
-def test_one_that_is_not_paced_repeats_to_the_bit():
+@pytest.mark.parametrize(
+    ("device", "stronger"),
+    [("vt-plate", RIDGES), ("electroadhesion", hr.Grating(frequency=90.0, amplitude=20e-6))],
+)
+def test_one_that_is_not_paced_repeats_to_the_bit(device, stronger, monkeypatch):
+    """Also block by block, as a driver of one's own is played; a stronger texture gives a screen another bias."""
+
     def drive():
-        with hr.Player(paced=False, seed=3) as player:
+        with hr.Player(device, paced=False, seed=3) as player:
             player.play(TONE)
             slide(player, 0.1)
-            player.play(RIDGES)
+            player.play(stronger)
             slide(player, 0.2)
             return player._loop.log(0)["drive"]
 
-    np.testing.assert_array_equal(drive(), drive())
+    at_once = drive()
+    monkeypatch.setattr(SimulatedDriver, "device_loop", lambda self, controller: None)
+    np.testing.assert_array_equal(drive(), at_once)
 
 
 def test_it_is_what_render_plays(tmp_path):
