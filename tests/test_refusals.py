@@ -328,6 +328,11 @@ DESIGNS = [
         for method in ("boxcar", "static", "stiffness", "resonant")
     ),
     (lambda: in_blocks().run(*map(np.zeros, ((30, 2), 30, 30))), "30 samples: must be a multiple of the block of 25"),
+    (
+        lambda: in_blocks().run(*map(np.zeros, ((25, 1), 25, 25))),
+        r"of shapes \(\(25, 1\), \(25,\), \(25,\)\): must be \(\(25, 2\)",
+    ),
+    (lambda: in_blocks().run(*map(np.zeros, ((25, 2), 1, 25))), r"\(1,\), \(25,\)\): must be \(\(25, 2\), \(25,\)"),
     (lambda: demodulator(frequency=[]), "at least one number"),
     (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
     (lambda: demodulator().run(np.zeros((4, 2))), r"must be \(n, 1\)"),

@@ -123,6 +123,9 @@ class BankController(Addressed):
         n = len(sensed)
         if n % self.block:
             raise ValueError(f"{n} samples: must be a multiple of the block of {self.block} samples")
+        found, must = (sensed.shape, position.shape, waveform.shape), ((n, self.sensors), (n,), (n,))
+        if found != must:
+            raise ValueError(f"sensed, position and waveform of shapes {found}: must be {must}")
         kept = self._kept  # of blocks of this length: their addresses take longer than the step
         if kept is None or len(kept[0]["flags"]) != n:
             signals = {"sensed": np.zeros((n, self.sensors)), "position": np.zeros(n), "waveform": np.zeros(n)}
