@@ -90,6 +90,9 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
             made = factory(*[argument] * bool(colon), **known | options)
     except TypeError as error:
         raise ValueError(f"driver = {text!r}: {error}; give its argument as {name}:ARGUMENT?OPTION=VALUE") from error
+    if not hasattr(made, "play"):
+        kind = type(made).__name__
+        raise ValueError(f"driver = {text!r}: it returned a {kind}: must be a driver, see hapticrender.drivers.base")
     warn_of_calibration(text, profile, lambda name, _: name in taken or "profile" in taken)
     with suppress(TypeError):  # of what cannot be referred to weakly
         _MADE[id(made)] = made

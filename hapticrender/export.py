@@ -65,7 +65,7 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
         board: Any = copy(rendering.device)
         board.sensed_channels = 0
         rendering = prepare(rendering.scene, driver=board, compiled=False)
-    sizes, design = board_design(rendering, bands)
+    sizes, design, supervision = board_design(rendering, bands)
     texts = {path.name: path.read_text(encoding="utf-8") for path in sources()}
     for name, text in {} if force else {**texts, "design.h": GENERATED, "design.c": GENERATED}.items():
         path = folder / name
@@ -73,7 +73,7 @@ def export(rendering: Rendering, folder: Path, *, bands: int = 0, force: bool = 
             raise ValueError(f"{str(path)!r}: is not as it was written: choose another folder, or add --force")
     defines = "".join(f"#define LAW_{name} {value}\n" for name, value in sizes.items())
     texts["design.h"] = f"{GENERATED}#ifndef DESIGN_H\n#define DESIGN_H\n\n{defines}\n{_memory(sizes)}\n#endif\n"
-    tables = _table("design_t design", design), _table("supervision_t supervision", supervision_table(rendering))
+    tables = _table("design_t design", design), _table("supervision_t supervision", supervision)
     texts["design.c"] = f'{GENERATED}#include "supervisor.h"\n\n{tables[0]}\n{tables[1]}'
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
@@ -102,15 +102,15 @@ def sources() -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.name.endswith(SUFFIXES))
 
 
-def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any]]:
-    """Return sizes (in design.h) and fields of `design_t` for a rendering's controller; see `export` for the errors."""
+def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], dict[str, Any], dict[str, Any]]:
+    """Return sizes (in design.h), and fields of `design_t` and `supervision_t`; see `export` for the errors."""
     screen, used = _law(rendering) == "screen", rendering.bands
     if screen and rendering.design and rendering.scene.method == "inverse":  # whatever it plays is a waveform
         used = replace(Bands.none(spatial=False), differentiated=True)
-        controller: Any = rendering.design(used)
+        supervised: Any = rendering.design(used)
     else:
-        controller = rendering.controller()
-    controller = getattr(controller, "controller", controller)  # without its supervisor
+        supervised = rendering.controller()
+    controller = getattr(supervised, "controller", supervised)
     most = _checked(rendering, used, controller, bands)
     settings, law, model = controller.settings, controller.law, rendering.model
     sensors, channels, taps = (int(settings[name]) for name in ("sensors", "channels", "n_taps"))
@@ -148,7 +148,7 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
     fields["drive_from_force"] = fields["drive_from_force"][:channels]
     if len(used):
         fields["bands"] = used.set_points()
-    return sizes, fields | (_friction(rendering, settings) if screen else {})
+    return sizes, fields | (_friction(rendering, settings) if screen else {}), supervision_table(supervised)
 
 
 def _friction(rendering: Rendering, settings: Any) -> dict[str, Any]:
@@ -164,11 +164,10 @@ def _friction(rendering: Rendering, settings: Any) -> dict[str, Any]:
     }
 
 
-def supervision_table(rendering: Rendering) -> dict[str, Any]:
-    """Return the fields of `supervision_t` of a rendering's supervisor."""
-    if not rendering.driver.sensed_channels:
+def supervision_table(controller: Any) -> dict[str, Any]:
+    """Return the fields of `supervision_t` of a supervised controller."""
+    if not hasattr(controller, "gains"):
         return {"sensed_bound": HUGE}  # nothing is sensed, and nothing supervised
-    controller: Any = rendering.controller()
     settings, gains = controller.state["p"][0], controller.gains[0]
     return {
         **{name: np.clip(settings[name], -HUGE, HUGE) for name in _SUPERVISION},

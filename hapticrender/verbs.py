@@ -323,7 +323,7 @@ def export(arguments: argparse.Namespace) -> int:
     outputs.check_folder("--out", arguments.out)
     scene = validation.open_scene(arguments.scene)
     with naming(arguments.scene):
-        rendering = prepare(scene)
+        rendering = prepare(scene, compiled=False)
         written = export_design(rendering, arguments.out, bands=arguments.bands, force=arguments.force)
     folder = shlex.quote(str(arguments.out))
     print(f"wrote {len(written)} files into {arguments.out}; build them with: make -C {folder}")

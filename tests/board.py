@@ -191,11 +191,11 @@ class SteppedBoard:
     def driver(self, **options):
         return SerialDriver("stepped", background=False, clock=self, connect=self.connect, **options)
 
-    def started(self, bands=None, seconds=0.0, **options):
+    def started(self, bands=None, seconds=0.0, stream=0, **options):
         """Client whose board has played bands for some time; a tone of 47 Hz where none are given."""
         client = self.client(**options).open()
         client.set_bands(bands or tones(47.0))
-        client.start()
+        client.start(stream=stream)
         self.run(client, seconds)
         return client
 

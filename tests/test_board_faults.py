@@ -12,12 +12,21 @@ from hapticrender.drivers import protocol
 from hapticrender.drivers.protocol import Cause, Kind, Reason
 from hapticrender.drivers.serial import Line
 from hapticrender.errors import DeviceFault, DeviceLost, DeviceTimeout, DriverError, ProtocolError
+from hapticrender.protocols import Flag
 
 
 @pytest.fixture
 def stepped(tmp_path):
     with SteppedBoard(tmp_path) as board:
         yield board
+
+
+def assert_stopped(board, client, *causes):
+    """For one of the causes, with a flag, and nothing is driven any more."""
+    found = client._line.telemetry
+    assert found.cause in causes
+    assert found.flags & Flag.STOPPED
+    board.assert_at_rest()
 
 
 def test_a_board_that_stays_away_is_lost(stepped):
@@ -34,7 +43,7 @@ def test_a_board_that_stays_away_is_lost(stepped):
 
 def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     """No word for 100 ms of the board's clock: the host's process is stopped, so nothing else can say so."""
-    client = stepped.started(seconds=0.5)
+    client = stepped.started(seconds=0.5, stream=1)
     last = stepped.sample
     stepped.sleep(0.3)
     (silent,) = [int(line[0]) for line in stepped.board.log() if line[1:3] == ["state", "0"]]
@@ -43,6 +52,7 @@ def test_an_app_that_hangs_ends_in_zero_drive(stepped):
     assert int(stepped.board.log()[-1][0]) <= last + 0.100 * RATE
     with pytest.raises(DeviceLost, match="the board received no valid frame for 80 ms, and stopped"):
         stepped.run(client, 0.1)
+    assert client._line.streamed[-1].rows[-1][-1] & Flag.STOPPED
 
 
 def test_a_finger_that_is_not_heard_of_is_lifted(stepped):
@@ -63,11 +73,19 @@ def test_a_finger_that_is_not_heard_of_is_lifted(stepped):
     assert client.telemetry().position == pytest.approx(0.03, rel=1e-6)  # a touch is no glide
 
 
-def test_limits_stop_the_board(stepped):
+@pytest.mark.parametrize(
+    ("limits", "cause", "named"),
+    [
+        ((0.5, 0.05, 0.1), Cause.LIMIT, "the mean square of the drive is above its limit"),
+        ((0.5, 0.5, 0.1, 20e-6), Cause.BEYOND, r"a sensor shows more than \[limits\] displacement"),
+    ],
+)
+def test_limits_stop_the_board(stepped, limits, cause, named):
     client = stepped.started(tones(20.0, amplitude=30e-6), seconds=0.5)
-    client.limits(0.5, 0.05, 0.1)
-    with pytest.raises(DeviceFault, match="the board stopped: the mean square of the drive is above its limit"):
+    client.limits(*limits)
+    with pytest.raises(DeviceFault, match=f"the board stopped: {named}"):
         stepped.run(client, 1.0)
+    assert_stopped(stepped, client, cause)
 
 
 def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
@@ -76,7 +94,7 @@ def test_a_press_that_moves_the_plate_too_far_stops_the_board(stepped):
     client.finger(0.055, 0.0, 20.0)
     with pytest.raises(DeviceFault, match="the board stopped: the surface moved too far"):
         stepped.run(client, 0.2)
-    stepped.assert_at_rest()
+    assert_stopped(stepped, client, Cause.OVERMOTION)
 
 
 def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
@@ -85,33 +103,42 @@ def test_sensors_out_of_their_range_stop_an_identification(tmp_path):
         client = board.client().open()
         with pytest.raises(DeviceFault, match="the board stopped: a sensor was invalid for 10 ms"):
             client.identify([Line(0, 60.0, 0.05)], 1.0)
-        board.assert_at_rest()
+        assert_stopped(board, client, Cause.SENSOR)
+
+
+CREST = 2515  # sample at which the tone below is at its largest: a gain that changes there is a jump
 
 
 @pytest.mark.parametrize(
-    ("gains", "causes"),
+    ("gains", "start", "causes"),
     [
-        ("0,1", {Cause.FROZEN, Cause.INCONSISTENT}),
-        ("1,-1", {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
-        ("-1,-1", {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
+        ("0,1", 0, {Cause.FROZEN, Cause.INCONSISTENT}),
+        ("1,-1", 0, {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
+        ("-1,-1", 0, {Cause.SENSOR_GAIN, Cause.ACTUATOR_GAIN}),
+        ("0,1", CREST, {Cause.FROZEN}),
+        ("nan,1", CREST, {Cause.INVALID}),
+        *((gains, CREST, {Cause.SENSOR_GAIN}) for gains in ("-1,-1", "1,-1", "3,3", "0.1,0.1")),
     ],
 )
-def test_a_sensor_that_is_dead_or_inverted_stops_the_board(tmp_path, gains, causes):
-    with SteppedBoard(tmp_path, "--gain", gains) as board:
-        client = board.started(tones(72.0, amplitude=10e-6))
+def test_a_sensor_that_lies_stops_the_board(tmp_path, gains, start, causes):
+    """From sample `start` on; one that fails while it plays is named, and stopped within 10 ms."""
+    with SteppedBoard(tmp_path, "--gain", f"{gains},{start}") as board:
+        client = board.started(tones(72.0, amplitude=30e-6))
         with pytest.raises(DeviceFault, match="stepped: play: the board stopped: .*: check "):
             board.run(client, 2.0)
-        assert client._line.telemetry.cause in causes
-        board.assert_at_rest()
+        assert_stopped(board, client, *causes)
+        assert start == 0 or driven(board.board.log(), start + round(0.01 * RATE), board.sample) == []
 
 
 def test_garbage_is_no_sign_of_life(stepped, rng):
-    stepped.started(seconds=0.2)
+    client = stepped.started(seconds=0.2)
     last = stepped.sample
     for _ in range(20):
         stepped.inject(bytes(rng.integers(0, 256, 200, dtype="u1")))
         stepped.sleep(0.01)
     assert driven(stepped.board.log(), last + int(0.1 * RATE), stepped.sample) == []
+    with pytest.raises(DeviceLost, match="the board received no valid frame for 80 ms, and stopped"):
+        stepped.run(client, 0.1)
 
 
 @pytest.mark.parametrize(("late", "stops"), [(0.07, False), (0.09, True)])

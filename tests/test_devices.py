@@ -80,6 +80,8 @@ REFUSED = [
     ("tea:cup", ValueError, "driver = 'tea:cup': No module named 'tea'; installed are .*wavefile"),
     ("test_devices:Tea", ValueError, "has no attribute 'Tea'"),
     ("test_devices:NOT_CALLABLE", ValueError, "NOT_CALLABLE is a int: must be a class or a function"),
+    ("os:getcwd", ValueError, "driver = 'os:getcwd': it returned a str: must be a driver"),
+    ("gc:enable", ValueError, "driver = 'gc:enable': it returned a NoneType: must be a driver"),
     ("wavefile", ValueError, "driver = 'wavefile': .*missing.*path.*give its argument as wavefile:ARGUMENT"),
     ("wavefile:a.tea", ValueError, "ending '.tea' must be one of .wav"),
 ]

@@ -151,6 +151,23 @@ def test_a_board_that_is_pulled_is_lost_with_port_operation_and_bytes(program, t
     assert not recording.drive[-1].any()
 
 
+def test_a_sensor_that_dies_on_the_board_stops_live_play(program, tmp_path):
+    """Half a second after its reset; its supervisor's word for it is the error of the next call."""
+    with BoardProcess(program, tmp_path, *SLOW, "--gain", "0,1,2500") as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        driver.probe = False
+        dead = pytest.raises(hr.DeviceFault, match="tty: play: the board stopped: a sensor (repeats|is suddenly)")
+        with dead, hr.Player(driver=driver) as player:
+            player.play(TONE)
+            player.record(tmp_path / "dead.au")
+            player.sleep(10.0)
+        assert [line[2] for line in board.log() if line[1] == "drives"][-1] == "0"
+    recording = Recording.load(tmp_path / "dead.au")
+    assert recording.drive.any()
+    assert (recording.flags[:-1] & hr.Flag.STOPPED).any()  # of the board's fade; the last sample is the player's own
+    assert not recording.drive[-1].any()
+
+
 def test_the_board_stops_when_the_application_is_silent(program, tmp_path):
     """The player's threads go on, and so do the signs of life; only the calls of the application are missing."""
     with BoardProcess(program, tmp_path, *SLOW) as board:

@@ -190,12 +190,13 @@ FAILING = [
 
 
 @pytest.mark.parametrize(("kind", "make", "error", "cause"), FAILING)
-def test_a_driver_that_fails_is_left_without_drive_at_once(kind, make, error, cause):
+def test_a_driver_that_fails_is_left_without_drive_at_once(kind, make, error, cause, tmp_path):
     """Before the application has called anything; so is one that is unplugged, where it can be reached again."""
     device, failed = make(), []
 
     def hang(player):
         player.play(TEXTURE)
+        player.record(tmp_path / "failed.au")
         player.finger(0.0, 0.08, 0.4)
         end = time.monotonic() + 60.0
         while player._error is None and time.monotonic() < end:
@@ -208,6 +209,9 @@ def test_a_driver_that_fails_is_left_without_drive_at_once(kind, make, error, ca
         hang(player)
     assert np.concatenate(failed).any()
     assert not failed[-1].any()
+    recording = hr.Recording.load(tmp_path / "failed.au")
+    assert recording.flags[-1] == hr.Flag.STOPPED
+    assert not recording.drive[-1].any()
 
 
 def test_a_watchdog_that_nobody_has_set_runs_in_real_time(monkeypatch):

@@ -241,6 +241,9 @@ def test_the_board_identifies_itself(tmp_path):
         rows = client.identify(lines, 1.0)
         board.run(client, 0.1)
         assert client.telemetry().cause == Cause.DONE
+        faded = client.rows()[:, -1]
+        assert len(faded) == 0.01 * RATE
+        assert not faded.any()
     drive, sensed = rows[:, :2], rows[:, 2:]
     assert rows.shape == (5000, 4)
     n = np.arange(4000)

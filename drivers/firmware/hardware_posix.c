@@ -2,13 +2,13 @@
  * The board as a process: its serial line is a pseudo-terminal, its sensors and coils are those of a plate model, and
  * the finger is where the host sends it.
  *
- *   board LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]
+ *   board LINK [--noise RMS] [--gain FIRST,SECOND[,SAMPLE]] [--log FILE] [--slow N] [--step]
  *
  * LINK becomes a symbolic link to the pseudo-terminal.  Paced by the clock, or by one that is N times as slow; with
  * --step by its standard input: a line
  * "SAMPLES BYTES" lets it run so many samples once it has received so many bytes in all, after which it writes
  * "SAMPLE BYTES", where it is and the bytes that it has sent in all.  FILE gets a line for whatever it executes.
- * --gain makes a sensor inverted (-1), dead (0) or wrong.
+ * --gain makes a sensor inverted (-1), dead (0), wrong or no number (nan), from SAMPLE on.
  */
 #define _XOPEN_SOURCE 700
 
@@ -35,6 +35,7 @@ const uint32_t hardware_cycle_rate = 1000000000u;
 static board_t board;
 static plate_t plate = PLATE_DEFAULT;
 static double gain[2] = {1.0, 1.0};               /* of the sensors */
+static uint32_t failing;                          /* sample from which on they have it */
 static int line = -1;                             /* master of the pseudo-terminal */
 static double slower = 1.0;                       /* than the clock */
 static int stepped;                               /* time comes from standard input */
@@ -131,7 +132,8 @@ void hardware_sense(real_t sensed[])
     double values[2];
     plate_sense(&plate, values);
     for (uint32_t s = 0; s < LAW_SENSORS; s++) {
-        sensed[s] = LAW_FRICTION != 0u ? REAL(0.0) : (real_t)(gain[s] * values[s]);
+        values[s] *= board.sample >= failing ? gain[s] : 1.0;
+        sensed[s] = LAW_FRICTION != 0u ? REAL(0.0) : (real_t)values[s];
     }
 }
 
@@ -221,7 +223,7 @@ static void open_line(void)
 
 static void take_option(const char *name, const char *value)
 {
-    if (strcmp(name, "--gain") == 0 && sscanf(value, "%lf,%lf", &gain[0], &gain[1]) == 2) {
+    if (strcmp(name, "--gain") == 0 && sscanf(value, "%lf,%lf,%" SCNu32, &gain[0], &gain[1], &failing) >= 2) {
         return;
     }
     if (strcmp(name, "--noise") == 0 && sscanf(value, "%lf", &plate.noise) == 1) {
@@ -247,7 +249,7 @@ int main(int argc, char **argv)
 {
     struct sigaction action;
     if (argc < 2) {
-        fprintf(stderr, "usage: board LINK [--noise RMS] [--gain FIRST,SECOND] [--log FILE] [--slow N] [--step]\n");
+        fprintf(stderr, "usage: board LINK [--noise RMS] [--gain FIRST,SECOND[,SAMPLE]] [--log FILE] [--slow N] [--step]\n");
         return 2;
     }
     link_path = argv[1];
