@@ -287,17 +287,21 @@ class BoardClient(OpenedInWith):
     def rows(self, count: int | None = None, meanwhile: Callable[[], None] = lambda: None) -> Array:
         """Return rows that the board streamed back, see `Rows`: the next `count`, or those that have arrived.
 
-        While rows are awaited `meanwhile` is called again and again.  A `DeviceTimeout` where none come.
+        While rows are awaited `meanwhile` is called again and again.  A `DeviceTimeout` where none come.  After an
+        error those that had arrived are there, without `count`, before it is raised again.
         """
         end = self.clock.monotonic() + self.timeout
         while True:
             with self._lock:
-                streamed, rows = self._open_line().streamed, self._rows
-                while streamed:
-                    rows.add(streamed.popleft())
+                line, rows = self._line, self._rows
+                while line is not None and line.streamed:
+                    rows.add(line.streamed.popleft())
                     end = self.clock.monotonic() + self.timeout
-                if count is None or len(rows) >= count:
+                if len(rows) >= (count or 1):
                     return rows.take(count)
+                self._open_line()
+                if count is None:
+                    return rows.take()
             if self.clock.monotonic() >= end:
                 raise DeviceTimeout(f"{self.port}: stream: {len(rows)} of {count} rows in {self.timeout:g} s")
             meanwhile()

@@ -115,7 +115,11 @@ class SerialDriver(BaseDriver):
                 self._begun = True
                 loop.start()
                 self._started = self.client.clock.monotonic()
-            found = self.signals(self.client.rows(count, self._point))
+            try:
+                rows = self.client.rows(count, self._point)
+            except DeviceFault:
+                rows = self.client.rows()  # until it stopped, `fault` says why
+            found = self.signals(rows)
             target = self._targets(rendering, found["position"])
             names = ("sensed", "position", "normal_load", "flags")
             return found["drive"], target, found["flags"], Sensed(**{name: found[name] for name in names})
@@ -153,6 +157,15 @@ class SerialDriver(BaseDriver):
         """What the board's law has learned of its device, as `hapticrender.loop.differences` takes it; None: lost."""
         with suppress(HapticError):  # what was played before stays
             return self.client.telemetry()
+        return None
+
+    @property
+    def fault(self) -> DeviceFault | None:
+        """Why the board has stopped by itself, if it has said so."""
+        try:
+            self.client.telemetry()
+        except HapticError as error:
+            return error if isinstance(error, DeviceFault) else None
         return None
 
     def _point(self) -> None:

@@ -48,7 +48,7 @@ class DeviceFault(DriverError):
     """The device does not follow its drive: states the most likely cause, when, and what to check.
 
     `time` (s) counts from the start of the run, NaN before it; `recording` holds every sample that was played, None
-    before the first one.  Where a board has stopped itself they are NaN and None.
+    before the first one.
     """
 
     def __init__(self, message: str, time: float = math.nan) -> None:

@@ -363,6 +363,10 @@ class _Loop:
         """Return why the drive was stopped, if it was."""
         if self._stopped < 0:
             return None
+        stated = getattr(self.rendering.driver, "fault", None)
+        if isinstance(stated, DeviceFault):
+            stated.time = self._stopped / self.rendering.driver.rate
+            return stated
         return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
     def _exchange(self, position: Array, load: Array) -> None:

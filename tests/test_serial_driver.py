@@ -166,9 +166,14 @@ def test_the_limits_of_a_device_are_held_on_a_board(fast):
         ({"rms_drive": 0.5 * rms, "rms_time": 0.1}, "the mean square of the drive is above its limit"),
         ({"displacement": 0.5 * abs(free.sensed).max()}, r"a sensor shows more than \[limits\] displacement"),
     ):
-        with pytest.raises(DeviceFault, match=fault):
+        with pytest.raises(DeviceFault, match=fault) as caught:
             hr.render(replace(PRESSED, limits=limits), driver=fast.driver())
         fast.assert_at_rest()
+        played = caught.value.recording  # to the end of the board's fade, of 10 ms
+        stopped = round(caught.value.time * played.rate)
+        np.testing.assert_array_equal(played.flags & hr.Flag.STOPPED > 0, np.arange(len(played)) >= stopped)
+        assert played.drive[stopped - 1].any()
+        assert 10 <= len(played) - stopped <= 50
 
 
 def test_the_limits_of_a_device_are_held_live_on_a_board(fast):
