@@ -203,7 +203,7 @@ class NaiveInverse:
     def played(self):
         """Parameters, heave's by the share of what they explain that is not the sensor's noise."""
         theta = self.theta.copy()
-        theta[HEAVE:COUPLING] *= 1.0 - min(self.heave[1] / max(self.heave[0], 1e-300), 1.0)
+        theta[HEAVE:COUPLING] *= 1.0 - np.clip(self.heave[1] / max(self.heave[0], 1e-300), 0.0, 1.0)
         return theta
 
     def levelling_force(self):

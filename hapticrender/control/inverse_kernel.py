@@ -170,7 +170,7 @@ def learned_force(controller, inverse):
         heave += theta[HEAVE + i] * basis[i]
         rocking += theta[COUPLING + i] * basis[i]
     finger *= v.contact * (c.p.pattern[0] + v.lever * c.p.pattern[1])
-    heave = (heave + theta[HEAVE + 3] * basis[5]) * (1.0 - min(v.heave_noise / max(v.heave_power, TINY), 1.0))
+    heave = (heave + theta[HEAVE + 3] * basis[5]) * (1.0 - min(max(v.heave_noise / max(v.heave_power, TINY), 0.0), 1.0))
     return finger + c.p.pattern[0] * heave, v.lever * finger + rocking
 
 
