@@ -21,8 +21,8 @@ def tone(frequency, force=FORCE, finger=SLIDE, duration=2.0, **plant):
 class Screen(Told):
     """A screen of the user's own: it takes the envelope, in blocks, and shows friction or, blind, nothing."""
 
-    def __init__(self, *, blind=True, block=1, finger=SLIDE, tell=lambda sample, sensed: sensed, **parameters):
-        super().__init__(ElectroadhesionScreen(ElectroadhesionParameters(**parameters), finger, seed=1), tell)
+    def __init__(self, *, blind=True, block=1, seed=1, finger=SLIDE, tell=lambda sample, sensed: sensed, **parameters):
+        super().__init__(ElectroadhesionScreen(ElectroadhesionParameters(**parameters), finger, seed=seed), tell)
         self.block = self.delay = block
         self.sensed_channels = 0 if blind else 1
 

@@ -29,6 +29,7 @@ class NaiveInverse:
         self.samples = self.away = 0
         self.noise, self.last = 0.0, np.zeros(3)
         self.size = np.zeros(2)
+        self.heave = np.zeros(2)  # mean squares of what heave's parameters explain, and of noise in it
         self.earlier = 2 * ((self.theta[HEAVE:LOAD].copy(), self.P[HEAVE:LOAD, HEAVE:LOAD].copy()),)
 
     def step(self, sensed, position, waveform):
@@ -53,7 +54,7 @@ class NaiveInverse:
             self.discretise()
         beta, d1, d2 = self.find_basis(n)
         nominal = self.K @ self.alpha * beta[0] + self.C @ self.alpha * d1 + self.M @ self.alpha * d2
-        force = nominal + self.directions() @ self.theta[:COUNT] + self.levelling_force()
+        force = nominal + self.directions() @ self.played() + self.levelling_force()
         force = force - (self.open * p["damper_high"]) * (self.taps * self.past).sum(axis=1)
         drive = self.play(force)
         self.forces.append((beta, self.to_force @ drive - nominal))
@@ -142,6 +143,9 @@ class NaiveInverse:
         square = dev_u**2 + self.law["deviations"] * dev**2 + self.law["innovations"] * e**2
         self.size[i] += self.law["mean_square_smoothing"] * (square - self.size[i])
         noise = self.law["noise"][i] + self.law["model_error"] * self.size[i]
+        own = slice(HEAVE, COUPLING)
+        now = np.array([(psi[own] @ self.theta[own]) ** 2, self.law["noise_share"] * psi[own] @ self.P[own] @ psi])
+        self.heave += self.law["power_smoothing"] * (now - self.heave)
         gain = self.P @ psi / (psi @ self.P @ psi + noise)
         self.theta = self.theta - gain * e
         self.P = self.P - np.outer(gain, psi @ self.P)
@@ -195,6 +199,12 @@ class NaiveInverse:
         found[0, HEAVE : HEAVE + 4] = self.alpha[0] * basis[[0, 1, 2, 5]]
         found[1, COUPLING : COUPLING + 3] = basis[:3]
         return found
+
+    def played(self):
+        """Parameters, heave's by the share of what they explain that is not the sensor's noise."""
+        theta = self.theta.copy()
+        theta[HEAVE:COUPLING] *= 1.0 - np.clip(self.heave[1] / max(self.heave[0], 1e-300), 0.0, 1.0)
+        return theta
 
     def levelling_force(self):
         target = self.contact * np.clip(self.lever * self.theta[LOAD] + self.theta[LOAD + 1], -1.0, 1.0)

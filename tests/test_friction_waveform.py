@@ -12,10 +12,8 @@ from test_identify_friction import Screen as StrangersScreen
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
-from hapticrender.control.inverse import FRICTION, FRICTION_NOISE
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.plants.identify_friction import identify_resonance, identify_screen
-from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 RATE = 5000.0
@@ -90,7 +88,7 @@ def ridges(wavelength=1e-3, speed=0.05, rate=10e3):
 def test_recorded_ridges_follow_a_finger_that_swipes(device):
     swipe = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4)
     recording = hr.render(hr.Scene(texture=ridges(), finger=swipe, device=device, duration=2.0, seed=2))
-    assert waveform_error(recording) < MUST  # ultrasonic: 2.60 to 2.68 % over three seeds of the noise; a screen 0.97 %
+    assert waveform_error(recording) < MUST  # ultrasonic: 2.53 to 2.65 % over three seeds of the noise; a screen 0.96 %
 
 
 def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
@@ -216,32 +214,43 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     assert recording.summary()["verdict"] != "passed"
 
 
-@pytest.mark.parametrize(("wavelength", "sensors"), [(1e-3, ("open", "closed")), (0.5e-3, ("open", "closed", "quiet"))])
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength, sensors):
-    """Ridges under swipes at 3 Hz: the sign turns with the finger, the friction does not.
+@pytest.mark.parametrize("wavelength", [1e-3, 0.5e-3])
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
+    """Ridges under swipes at 3 Hz, two seeds of the noise: the sign turns with the finger, the friction does not.
 
-    Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise.  With
-    c the prior's variance over that assumed of N samples, a Kalman filter makes of noise of variance s^2 the variance
-    s^2/N (c N/(1 + c N))^2 of the waveform, at most c s^2/4 whatever N is: of 0.4 of the waveform and 0.05 N that is
-    0.4 s/(2 * 0.05 N), 0.4 % for 1 mN; two standard deviations.  A sensor without noise costs nothing.
+    Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise, which
+    is not played: it would leave 0.598 and 0.557 % of 0.5 mm for 0.456.  0.01 % is the last digit of the figures.
     """
-    finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), {}
+    finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), []
     way = np.sign(np.diff(finger.position(np.arange(8_000) / 10e3)))
-    learned = 2 * FRICTION[0] * SlidingParameters().force_noise / (2 * FRICTION_NOISE)
 
     def signed(sample, sensed):
         return sensed._replace(sensed=sensed.sensed * way[sample], motion=None)
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
     late = slice(3_333, 6_667)  # one swipe
-    for name in sensors:
-        quiet = {"force_noise": 0.0} if name == "quiet" else {}
-        screen = Screen(finger=finger, tell=signed, blind=name == "open", **quiet)
+    for seed in (0, 1, 5):  # 0: open loop
+        screen = Screen(finger=finger, tell=signed, blind=seed == 0, seed=seed)
         scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=0.7)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
-        errors[name] = np.std(played - asked) / np.std(asked)
-    assert max(errors.values()) < 0.02  # what the project has set itself
-    assert errors.get("quiet", 0.0) < errors["open"] + 1e-4  # 0.01 %, the last digit that is printed
-    assert errors["closed"] < (np.hypot(errors["open"], learned) if wavelength < 1e-3 else errors["open"] + 5e-4)
+        errors.append(np.std(played - asked) / np.std(asked))
+    assert max(errors) < 0.02  # what the project has set itself
+    assert max(errors[1:]) < errors[0] + 1e-4
+
+
+def test_a_contact_area_is_learned_through_noise_larger_than_the_texture():
+    """20 mN in 11 mN rms: an area 10 % off is 11 % of the waveform unlearned, and far beyond a standard error."""
+    tone = np.sin(2 * np.pi * 100.0 * np.arange(10_000) / RATE)
+    noise = {"force_noise": 0.02}
+    scene = hr.Scene(
+        texture=hr.Recorded(samples=tone, rate=RATE, amplitude=16e-6),
+        finger=FINGERS["usual"],
+        device="electroadhesion",
+        duration=2.0,
+        settle=1.0,
+        profile=noise,
+        simulation=noise | {"area_scale": 0.9},
+    )
+    assert waveform_error(hr.render(scene)) < 0.11 / 2

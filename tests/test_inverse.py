@@ -50,15 +50,15 @@ def test_pair_of_poles_is_that_of_the_differential_equation():
     assert np.allclose(found, exact, atol=1e-6 * abs(exact).max())
 
 
-@pytest.mark.parametrize("spatial", [False, True])
-def test_kernel_equals_its_twin(spatial):
+@pytest.mark.parametrize(("spatial", "noise_share"), [(False, 0.0), (True, 0.0), (False, 0.1)])
+def test_kernel_equals_its_twin(spatial, noise_share):
     """Touch, learning, the damper and its gate, saturation and lift-off, from equations and in compiled code."""
     rng, n = np.random.default_rng(4), 900
     model = replace(
         PLATE.device_model(RATE, 2), drive_step=0.0, drive_limit=0.1
     )  # a last bit would decide which way it rounds
     controller = AdaptiveInverse().design(model, NOTHING)
-    controller.law["spatial"] = spatial
+    controller.law["spatial"], controller.law["noise_share"] = spatial, noise_share
     law = {name: controller.law[name].copy() for name in controller.law.dtype.names}
     settings = controller.settings
     twin = NaiveInverse({name: settings[name] for name in settings.dtype.names}, law)

@@ -274,9 +274,9 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     mean, covariance = prior(model)
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1))
     noise = np.resize(noise, 2) * max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
-    factor = np.ones(PARAMETERS)
-    friction = {LOAD: FRICTION_REVERSION} if model.finger.contact is None else {}
-    for first, rate in (REVERSION_RATES | friction).items():
+    factor, friction = np.ones(PARAMETERS), model.finger.contact is None
+    variance = 6.0 * noise**2 + (FRICTION_NOISE**2 if friction else 0.0)
+    for first, rate in (REVERSION_RATES | ({LOAD: FRICTION_REVERSION} if friction else {})).items():
         factor[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
     matrices = {}
     for name, value in before_contact(model).items():
@@ -307,14 +307,15 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
         "pole_step": pole_step(model.rate),
         "force_from_drive": padded(model.force_from_drive, 2, MOST_CHANNELS),
         **matrices,
-        "noise": 6.0 * noise**2 + (FRICTION_NOISE**2 if model.finger.contact is None else 0.0),
+        "noise": variance,
+        "noise_share": noise[0] ** 2 / variance[0] if friction else 0.0,
         "prior": mean,
         "prior_covariance": covariance,
         "covariance": covariance,
         "earlier": np.vstack([covariance[HEAVE:LOAD, HEAVE:LOAD], mean[HEAVE:LOAD]]),
         "theta": mean,
         "reversion_factor": factor,
-        "initial_variance": np.repeat(INITIAL_FRICTION if model.finger.contact is None else INITIAL_MOTION, 2) ** 2,
+        "initial_variance": np.repeat(INITIAL_FRICTION if friction else INITIAL_MOTION, 2) ** 2,
         "scale": 1.0,
         "smooth_scale": 1.0,
         "least_scale": 1.0,

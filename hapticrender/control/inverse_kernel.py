@@ -51,6 +51,7 @@ REVERSION = 20  # samples between two steps of the parameters' reversion to thei
 LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
 HUGE = 1e6  # drive unit: no drive
+TINY = 1e-300  # m^2 or N^2: nothing was learned
 NOISE_SMOOTHING = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
 MOST_NOISE = 25.0  # of the sensors' stated one, as mean squares
 FORCE = Y  # rows of a sample's forces, once its measurements have been read
@@ -159,7 +160,7 @@ def damp(controller, inverse, coordinate, deviation):
 
 @kernel
 def learned_force(controller, inverse):
-    """What was learned of finger and device, as the forces that it takes in heave and rocking."""
+    """What was learned of finger and device, less what the sensor's noise taught, as forces in heave and rocking."""
     c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
     theta, basis = v.theta, v.basis
     finger = heave = rocking = 0.0
@@ -169,7 +170,8 @@ def learned_force(controller, inverse):
         heave += theta[HEAVE + i] * basis[i]
         rocking += theta[COUPLING + i] * basis[i]
     finger *= v.contact * (c.p.pattern[0] + v.lever * c.p.pattern[1])
-    return finger + c.p.pattern[0] * (heave + theta[HEAVE + 3] * basis[5]), v.lever * finger + rocking
+    heave = (heave + theta[HEAVE + 3] * basis[5]) * (1.0 - min(max(v.heave_noise / max(v.heave_power, TINY), 0.0), 1.0))
+    return finger + c.p.pattern[0] * heave, v.lever * finger + rocking
 
 
 @kernel
@@ -215,7 +217,7 @@ def recover(controller, inverse):
     reset_parameters(inverse, FINGER, PARAMETERS)
     note_device(inverse)
     note_device(inverse)
-    v.moment = v.slow = v.power = v.nominal_power = v.learned_power = v.peak = 0.0
+    v.moment = v.slow = v.power = v.nominal_power = v.learned_power = v.heave_power = v.heave_noise = v.peak = 0.0
     v.model_power[0] = v.model_power[1] = v.poles[0] = v.poles[1] = 0.0
     v.scale = v.smooth_scale = 1.0
     for k in range(4):

@@ -247,12 +247,18 @@ def learn(inverse, coordinate, error):
     square = explained * explained + v.deviations * error * error + v.innovations * innovation * innovation
     v.model_power[coordinate] += v.mean_square_smoothing * (square - v.model_power[coordinate])
     variance = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
+    heave = uncertain = 0.0
     for i in range(PARAMETERS):
         found = 0.0
         for j in range(PARAMETERS):
             found += covariance[i, j] * states[coordinate, j]
         p_psi[0, i] = found
         variance += found * states[coordinate, i]
+        if HEAVE <= i < COUPLING:
+            heave += theta[i] * states[coordinate, i]
+            uncertain += found * states[coordinate, i]
+    v.heave_power += v.power_smoothing * (heave * heave - v.heave_power)
+    v.heave_noise += v.power_smoothing * (v.noise_share * uncertain - v.heave_noise)
     for i in range(PARAMETERS):
         kalman_gain = p_psi[0, i] / variance
         theta[i] -= kalman_gain * innovation

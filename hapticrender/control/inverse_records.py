@@ -24,10 +24,11 @@ gate_threshold hold decay high_pass_smoothing mean_square_smoothing scale_smooth
 # the reference's fade, the drive's largest need and for how long it is held, scale and its least; lever arm, contact,
 # samples since it changed and without a position (`away`; below 0: until the report of a suspected contact is due);
 # the gate's slow part, mean square and noise; r as the sensors should show it; levelling force; mean squares on the
-# untouched device, see `update_powers`; last sane sample of the waveform
+# untouched device, see `update_powers`; last sane sample of the waveform; mean squares of heave's part of psi^T theta,
+# and of what the sensor's noise alone makes of it
 _STATE = """
 fade peak hold_left scale smooth_scale least_scale lever contact since away slow power sensed_noise reference moment
-nominal_power learned_power reference_power last_waveform
+nominal_power learned_power reference_power last_waveform heave_power heave_noise
 """
 
 INVERSE = np.dtype(
@@ -44,6 +45,7 @@ INVERSE = np.dtype(
         ("noise", np.float64, (2,)),  # variances of heave and rocking: 6 (sensor noise)^2, first part of sigma_e^2
         *((name, np.float64) for name in ("deviations", "innovations")),  # weights of mean squares in `model_power`
         ("model_error", np.float64),  # part of `model_power` in sigma_e^2
+        ("noise_share", np.float64),  # (sensor noise)^2 over `noise` on friction devices, of P: noise's; else 0
         ("prior", np.float64, (ROWS - 1,)),  # mean
         ("prior_covariance", np.float64, (ROWS - 1, ROWS - 1)),
         ("reversion_factor", np.float64, (ROWS - 1,)),  # a_i: share of the distance from the prior that stays
