@@ -1,6 +1,7 @@
 """The loop of live play: driver and controller of a rendering, block by block, through the real-time entry."""
 
 import math
+import threading
 import time
 from dataclasses import replace
 from typing import Any
@@ -34,6 +35,7 @@ from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
+CATCH_UP = 5e-3  # s: of either pole
 TURN = 2e-3  # s: a simulated device held to the clock is played for so long at once
 PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
 REFRESH = 0.02  # s: after which a texture in time and place is evaluated again while its finger goes on as it did
@@ -45,21 +47,32 @@ Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved ampl
 
 
 class LiveMotion:
-    """Motion of the finger on a simulated device that is played live: as the application has last set it."""
+    """Motion of the finger on a simulated device that is played live: as the application has last set it.
+
+    A finger that is not where it was expected catches up as a mass does, by two poles: a leap would be a speed at which
+    nothing is felt of a vibration, and teach the controller another device.
+    """
 
     def __init__(self) -> None:
         self._clock = 0.0  # s
-        self._last = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
+        self._last = (0.0, math.nan, 0.0, 0.0, 0.0)  # since (s), position, velocity, load, how far it still is away
 
     def update(self, position: float, velocity: float, load: float) -> None:
         """Set the finger (m, m/s, N)."""
-        self._last = (self._clock, position, velocity, load)
+        away = float(self._place(np.array(self._clock), self._last)) - position
+        self._last = (self._clock, position, velocity, load, away if math.isfinite(away) else 0.0)
 
     def position(self, time: Array) -> Array:
         """Position (m) at `time` (s): at the last velocity, for `HORIZON` at most."""
-        time, (since, place, velocity, _) = np.asarray(time, float), self._last
+        time, last = np.asarray(time, float), self._last
         self._clock = float(time[-1]) if time.size else self._clock
-        return place + velocity * np.clip(time - since, 0.0, HORIZON)
+        return self._place(time, last)
+
+    def _place(self, time: Array, last: tuple[float, ...]) -> Array:
+        since, place, velocity, _, away = last
+        passed = np.maximum(time - since, 0.0)
+        constants = np.minimum(passed / CATCH_UP, 100.0)
+        return place + velocity * np.minimum(passed, HORIZON) + away * (1.0 + constants) * np.exp(-constants)
 
     def load(self, time: Array) -> Array:
         """Return the normal load (N)."""
@@ -98,10 +111,13 @@ class LiveLoop(RealtimeEntry):
         self._calls_back = bool(scales)
         offered = None if rendering.plant is None else getattr(self.driver, "device_loop", None)
         self._closed = None if offered is None else offered(self)  # a simulated device's loop in compiled code
-        called = self.plain_address if self._closed is None else self.step.address
-        _ = self.address if scales else called  # compiled before anything is live
+        if self._closed is not None:
+            self._closed(0, lambda position: position[:0])  # compiled before anything is live
+        else:
+            _ = self.address if scales else self.plain_address
         rows = len(self._arrays["log"])
         self._true = np.full((rows, len(self.model.places) + 1), np.nan)  # motion and load, where stated
+        self._turn = threading.Lock()  # of threads that play what is not paced
         self._known = 0  # samples that have been played, and whose motion is known
         self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
         self._itself = False  # whether it has stopped itself
@@ -133,7 +149,11 @@ class LiveLoop(RealtimeEntry):
         `late`: the device was left behind by the clock before it.  A simulated device in compiled code plays `most`
         samples, up to `PIECE`, or `TURN`.  Returns how many were played.
         """
-        first, flags = self.samples, Flag.OVERRUN if late else 0
+        with self._turn:
+            return self._advance(sensing, Flag.OVERRUN if late else 0, most)
+
+    def _advance(self, sensing: bool, flags: int, most: int) -> int:
+        first = self.samples
         if self._closed is None:
             sensed = self._exchange(sensing, flags)
         else:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,8 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
                     recorder.append(**signals)
 
     device = rendering.device
+    if rendering.plant is None:
+        load_ahead()
     with stopped_by_signal(), recorder, ended_with_program() as ending, opened(driver, device):
         if rendering.probe is not None:
             rendering.probe(device)
@@ -168,6 +171,12 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     recording.warnings = compared
     warn_of(recording.warnings, recording)
     return recording
+
+
+def load_ahead() -> None:
+    """Import what would else be imported while a device plays, which waits for it: up to 0.1 s, a board 80 ms."""
+    for name in ("scipy.fft", "scipy.ndimage", "scipy.signal", "scipy.special", "soundfile"):
+        import_module(name)
 
 
 def recorder_of(rendering: Rendering, journal: str | Path | None = None, **changes: Any) -> Recorder:

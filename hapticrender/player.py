@@ -404,8 +404,9 @@ class Player(Addressed):
         """Play for so long in this thread."""
         loop = self._loop
         left = max(round(seconds * loop.driver.rate / loop.driver.block), 1) * loop.driver.block
-        while left > 0:
-            left -= self._block(most=left)
+        while left > 0 and not self._stopping.is_set():
+            with stopped_by_signal(wait=True):  # else lost where compiled code calls a texture in Python
+                left -= self._block(most=left)
         with self._lock:
             self._watch()
             self._go_on()

@@ -7,7 +7,7 @@ holds no lock, allocates nothing and never waits: textures and the finger's posi
     stream = open_audio(callback=entry.address, user_data=entry.user_data, frames=entry.block)
     entry.play(SampledTexture(texture, rate))              # from any thread of the application, one at a time
     entry.play(SampledTexture(texture, rate), controller)  # where the controller works by bands: one designed for them
-    entry.finger(0.01, velocity=0.05)  # m, m/s; extrapolated at this speed until the next call
+    entry.finger(0.01, velocity=0.05)  # m, m/s; extrapolated at this speed for 50 ms
     entry.samples, entry.flags         # what has happened
     entry.silence()                    # zero drive, before the stream is closed
 

@@ -20,6 +20,7 @@ from hapticrender.cli import main
 from hapticrender.live_loop import LiveLoop
 from hapticrender.process_signals import Terminated
 from hapticrender.recordings.recording import Recording
+from hapticrender.sampled_texture import EvaluatedTexture
 
 
 def fail(player):
@@ -366,3 +367,47 @@ def test_a_program_that_ends_before_its_with_statement_leaves_zero_drive(enter, 
     assert drive[:-2].any()
     assert not drive[-1].any()
     assert len(Recording.load(journal)) >= 1500
+
+
+class Woven:
+    """A texture of time and place at once, which compiled code reads from Python."""
+
+    spatial = False
+
+    def bands(self, rate):
+        return TONE.bands(rate)
+
+    def waveform(self, time, position):
+        return 2e-6 * np.sin(200 * np.pi * time) * np.cos(2e3 * np.pi * np.nan_to_num(position))
+
+
+def test_ctrl_c_is_not_lost_where_compiled_code_calls_a_texture(monkeypatch):
+    """An exception in such a call, before the texture has its turn, cannot come out of it."""
+    evaluate = EvaluatedTexture._evaluate
+
+    def interrupted(self, sample):
+        if sample == 500:
+            signal.raise_signal(signal.SIGINT)
+        return evaluate(self, sample)
+
+    monkeypatch.setattr(EvaluatedTexture, "_evaluate", interrupted)
+    with hr.Player(paced=False) as player:
+        player.play(Woven())
+        with pytest.raises(KeyboardInterrupt):
+            player.sleep(0.2)
+
+
+def test_threads_that_play_what_is_not_paced_take_turns():
+    with hr.Player(paced=False) as player:
+        player.play(TONE)
+        player.sleep(0.1)
+        threads = [threading.Thread(target=lambda: [player.sleep(0.01) for _ in range(50)]) for _ in range(4)]
+        for each in threads:
+            each.start()
+        for each in threads:
+            each.join()
+        state = player.state()
+    assert state.time == pytest.approx(2.1, rel=1e-9)
+    assert state.lost == 0
+    assert state.flags == hr.Flag(0)
+    assert state.bands[0].error < 0.02

@@ -150,7 +150,7 @@ def _verdict(recording: Recording, worst: dict[str, Any], misses: bool, noise: f
     if raised:
         return "failed", f"flags that are not allowed: {', '.join(raised).lower()}"
     if unjudged or (unjudged := _cut(recording)):
-        return "not judged", unjudged
+        return "not judged", "; ".join(filter(None, (_stopped(recording), unjudged)))
     if found["share_outside"] > UNPLAYABLE:
         return "passed in band", _unplayable(found["share_outside"])
     return "passed", ""
