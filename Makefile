@@ -33,8 +33,11 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
 	@rm -rf build/real_time
-	@$(IN_REAL_TIME) $(PYTEST_ARGS) --maxfail=0 || { [ $$? = 1 ] && echo "repeated, as they failed in real time:" \
-		&& $(IN_REAL_TIME) --last-failed --last-failed-no-failures none $(PYTEST_ARGS); }
+	@$(IN_REAL_TIME) $(PYTEST_ARGS) --maxfail=0 || case $$? in \
+		1) echo "repeated, as they failed in real time:"; \
+			$(IN_REAL_TIME) --last-failed --last-failed-no-failures none $(PYTEST_ARGS);; \
+		134) echo "begun anew, as PortAudio ended the process (docs/realtime.md):"; $(IN_REAL_TIME) $(PYTEST_ARGS);; \
+		*) false;; esac
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
 
 # Tests of what is missing are skipped, and say so.

@@ -73,15 +73,15 @@ def finger_latency(calls: int) -> tuple[float, int, int]:
     return float(np.median(spent)), first, tenth
 
 
-def simulated_share() -> float:
-    """Processor time over that of the signal, of a simulated plate at 5 kHz that is held to the clock."""
-    with hr.Player("vt-plate") as player:
+def simulated(paced: bool) -> tuple[float, int]:
+    """Processor time over that of the signal of a simulated plate at 5 kHz, and samples lost."""
+    with hr.Player("vt-plate", paced=paced) as player:
         player.play(TEXTURES["8 tones"])
         player.finger(0.0, 0.0, 0.4)
         player.sleep(0.5)
         start = time.process_time()
         player.sleep(3.0)
-        return (time.process_time() - start) / 3.0
+        return (time.process_time() - start) / 3.0, player.state().lost
 
 
 def session(finger: tuple[float, ...], place: float, phase: float) -> np.ndarray:
@@ -130,7 +130,9 @@ def main() -> None:
     call, first, tenth = finger_latency(calls)
     late = f"{first} samples later ({1e3 * first / RATE:.2f} ms), by a tenth {1e3 * tenth / RATE:.1f} ms"
     print(f"Player.finger(): {1e6 * call:.1f} us; the device plays another drive {late}")
-    print(f"simulated plate held to the clock: {100 * simulated_share():.0f} % of a processor")
+    for paced, how in ((True, "held to the clock"), (False, "not paced")):
+        share, lost = simulated(paced)
+        print(f"simulated plate, {how}: {200 * share:.1f} us of a processor a sample of 200, {lost} lost")
     cases = itertools.product(FINGERS.values(), (0.0, 0.02), (0.0, 0.3))
     runs = [session(*case) for case in itertools.islice(cases, arguments.sessions)]
     median, worst = 100 * np.median(runs, axis=0), 100 * np.max(runs, axis=0)

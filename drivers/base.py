@@ -48,6 +48,8 @@ A driver carries samples to a device, a file or a plant model, and back.  Any ob
     a whole closed loop of its own, sample by sample; see ``protocols.DeviceLoop``
 ``learned`` (optional)
     of an open device with a controller of its own: what `hapticrender.loop.differences` takes, as `mismatch`
+``fault`` (optional)
+    of such a device: a ``DeviceFault`` where it has stopped by itself, else None
 ``found()`` (optional, class method)
     list of str: the devices that are there now, each as the driver's argument, two spaces, and what it can do; shown
     by ``hapticrender devices``

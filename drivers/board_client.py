@@ -162,6 +162,11 @@ class BoardClient(OpenedInWith):
             carry_through(*([self.stop] if self._runs and not self._error else []), self._close_line)
 
     @property
+    def failure(self) -> HapticError | None:
+        """The error with which the client has ended, if it has."""
+        return self._error
+
+    @property
     def capabilities(self) -> Capabilities:
         """Sizes, limits and rates that the board states."""
         return self._open_line().capabilities

@@ -162,11 +162,7 @@ class SerialDriver(BaseDriver):
     @property
     def fault(self) -> DeviceFault | None:
         """Why the board has stopped by itself, if it has said so."""
-        try:
-            self.client.telemetry()
-        except HapticError as error:
-            return error if isinstance(error, DeviceFault) else None
-        return None
+        return self.client.failure if isinstance(self.client.failure, DeviceFault) else None
 
     def _point(self) -> None:
         if self.finger is None:

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +27,7 @@ from hapticrender.loop import (
     motion_source,
     stops_itself,
 )
+from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Array, Controller, Flag, Rendering, Sensed
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
@@ -35,7 +37,7 @@ from hapticrender.touch.finger import Finger
 
 JUDGED = 0.25  # s: of signal that figures are of
 DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its texture changes
-CATCH_UP = 5e-3  # s: of either pole
+CATCH_UP, MOST_CONSTANTS = 5e-3, 100.0  # s: time constant of either pole; what is left after so many is 0
 TURN = 2e-3  # s: a simulated device held to the clock is played for so long at once
 PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
 REFRESH = 0.02  # s: after which a texture in time and place is evaluated again while its finger goes on as it did
@@ -46,33 +48,42 @@ LEAST_TARGET = 1e-12  # in the device's unit: a smaller one has no error
 Row = tuple[float, float, float, float]  # frequency (Hz), target, achieved amplitude, relative error
 
 
+def uninterrupted() -> AbstractContextManager[None]:
+    """Let signals wait in the main thread: an exception is lost where compiled code calls a texture in Python."""
+    main = threading.current_thread() is threading.main_thread()
+    return stopped_by_signal(wait=True) if main else nullcontext()
+
+
 class LiveMotion:
     """Motion of the finger on a simulated device that is played live: as the application has last set it.
 
-    A finger that is not where it was expected catches up as a mass does, by two poles: a leap would be a speed at which
-    nothing is felt of a vibration, and teach the controller another device.
+    A finger that is not where it was expected catches up by two poles, whatever the distance: a real one cannot leap,
+    and at 40 m/s no vibration is felt, which would teach the controller another device.
     """
 
     def __init__(self) -> None:
         self._clock = 0.0  # s
-        self._last = (0.0, math.nan, 0.0, 0.0, 0.0)  # since (s), position, velocity, load, how far it still is away
+        self._last = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
+        self._left = (0.0, 0.0)  # m: distance to catch up at `since`, behind both poles and behind the first one
 
     def update(self, position: float, velocity: float, load: float) -> None:
         """Set the finger (m, m/s, N)."""
-        away = float(self._place(np.array(self._clock), self._last)) - position
-        self._last = (self._clock, position, velocity, load, away if math.isfinite(away) else 0.0)
+        since, place, before, _ = self._last
+        passed = max(self._clock - since, 0.0)
+        jump = place + before * min(passed, HORIZON) - position
+        constants, both, first = min(passed / CATCH_UP, MOST_CONSTANTS), *self._left
+        decay = math.exp(-constants)
+        both, first = (both + first * constants) * decay, first * decay
+        self._left = (both + jump, first + jump) if math.isfinite(jump) else (0.0, 0.0)
+        self._last = (self._clock, position, velocity, load)
 
     def position(self, time: Array) -> Array:
         """Position (m) at `time` (s): at the last velocity, for `HORIZON` at most."""
-        time, last = np.asarray(time, float), self._last
+        time, (since, place, velocity, _), (both, first) = np.asarray(time, float), self._last, self._left
         self._clock = float(time[-1]) if time.size else self._clock
-        return self._place(time, last)
-
-    def _place(self, time: Array, last: tuple[float, ...]) -> Array:
-        since, place, velocity, _, away = last
         passed = np.maximum(time - since, 0.0)
-        constants = np.minimum(passed / CATCH_UP, 100.0)
-        return place + velocity * np.minimum(passed, HORIZON) + away * (1.0 + constants) * np.exp(-constants)
+        constants = np.minimum(passed / CATCH_UP, MOST_CONSTANTS)
+        return place + velocity * np.minimum(passed, HORIZON) + (both + first * constants) * np.exp(-constants)
 
     def load(self, time: Array) -> Array:
         """Return the normal load (N)."""
@@ -147,7 +158,7 @@ class LiveLoop(RealtimeEntry):
         """Exchange a block with the driver; `sensing`: its own sense of the finger is used, where it has one.
 
         `late`: the device was left behind by the clock before it.  A simulated device in compiled code plays `most`
-        samples, up to `PIECE`, or `TURN`.  Returns how many were played.
+        samples, or `TURN`.  Returns how many were played.
         """
         with self._turn:
             return self._advance(sensing, Flag.OVERRUN if late else 0, most)
@@ -157,21 +168,22 @@ class LiveLoop(RealtimeEntry):
         if self._closed is None:
             sensed = self._exchange(sensing, flags)
         else:
-            count = min(most or round(TURN * self.rate), round(PIECE * self.rate))
+            count = most or max(round(TURN * self.rate), 1)
             self._entry["given"], self._entry["lost"] = sensing, flags
-            count = 1 if self._reshaping is not self._reshaped else max(count, 1)
-            sensed = self._closed(count, lambda position: np.zeros(len(position)))[-1]
+            with uninterrupted():
+                count = 1 if self._reshaping is not self._reshaped else count
+                sensed = self._closed(count, lambda position: np.zeros(len(position)))[-1]
         at = (first + np.arange(len(sensed.sensed))) % len(self._true)
         if sensed.motion is not None:
             self._true[at, :-1], self._has_motion = sensed.motion, True
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
-        self.senses, self._itself = sensed.position is not None, self._itself or stops_itself(sensed, self.running)
+        self.senses = sensed.position is not None
         self._reshape()
+        self._known = first + len(at)
         for texture in self._textures:
             if isinstance(texture, EvaluatedTexture) and texture.error is not None:
                 raise texture.error
-        self._known = first + len(at)
         return len(at)
 
     def _exchange(self, sensing: bool, flags: int) -> Sensed:
@@ -182,8 +194,10 @@ class LiveLoop(RealtimeEntry):
         sensed = check_sensed(self.driver, self.driver.play(self._drive), places, self._has_motion)
         if sensed.flags is not None:
             flags |= int(np.bitwise_or.reduce(sensed.flags))
+        self._itself = self._itself or stops_itself(sensed, self.running)
         self._touches.slow()
-        self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
+        with uninterrupted():
+            self._drive = self.process(sensed.sensed, sensed.position if sensing else None, flags)
         return sensed
 
     def fill_some(self) -> None:
@@ -264,11 +278,12 @@ class LiveLoop(RealtimeEntry):
                 _widen(part, its_model)
         if controller is not self._control.controller:
             ready(controller)
-        self.play(texture, controller)
-        if rendering.shape is not None and hasattr(self._device, "reshape"):
-            self._device.reshape(rendering.shape)
-        elif rendering.shape is not None:
-            self._reshaping = self._device.shape, rendering.shape, self.samples
+        with nullcontext() if self._closed is None else self._turn:  # a piece is played with one shape
+            self.play(texture, controller)
+            if rendering.shape is not None and hasattr(self._device, "reshape"):
+                self._device.reshape(rendering.shape)
+            elif rendering.shape is not None:
+                self._reshaping = self._device.shape, rendering.shape, self.samples
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
         self.model = model
 

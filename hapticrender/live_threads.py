@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 from hapticrender.errors import DriverError, HapticError
 from hapticrender.live_loop import LiveLoop
-from hapticrender.loop import load_ahead
 
 NAP, LATE = 2e-3, 0.1  # s: shorter waits are not slept; so late the clock starts anew
 DRIFT = 0.01  # of the clock
@@ -17,7 +16,6 @@ class LiveThreads:
     """Threads that run until `stopping` is set; `hanging` is set where one does not end then."""
 
     def __init__(self) -> None:
-        load_ahead()
         self.stopping, self.hanging = threading.Event(), threading.Event()
 
     def start(self, target: Callable[[], None], failed: Callable[[BaseException], None]) -> threading.Thread:

@@ -145,7 +145,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
 
     device = rendering.device
     if rendering.plant is None:
-        load_ahead()
+        import_early()
     with stopped_by_signal(), recorder, ended_with_program() as ending, opened(driver, device):
         if rendering.probe is not None:
             rendering.probe(device)
@@ -173,7 +173,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     return recording
 
 
-def load_ahead() -> None:
+def import_early() -> None:
     """Import what would else be imported while a device plays, which waits for it: up to 0.1 s, a board 80 ms."""
     for name in ("scipy.fft", "scipy.ndimage", "scipy.signal", "scipy.special", "soundfile"):
         import_module(name)
@@ -313,6 +313,7 @@ class _Loop:
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
         self._has_motion = False  # whether the device states it
         self._recent = np.zeros(0, int)  # flags
+        self._short = False  # whether a device that runs the loop has played less than it was to
         self._stopped, self._itself = -1, False  # sample from which on the drive fades out; whether by the device
         self._drive = np.zeros((driver.block, driver.drive_channels))
         self._played: list[dict[str, Array]] = []  # blocks since `known`
@@ -324,6 +325,7 @@ class _Loop:
         self._count = count
         if self._device_loop is not None:
             self._keep(*self._device_loop(count, self._reference))
+            self._short = self._next < start + count
             return
         finger, block = self.rendering.scene.finger, self.rendering.driver.block
         time = self._time(-(-count // block) * block)  # whole blocks: a motion may end with the scene
@@ -364,18 +366,18 @@ class _Loop:
 
     @property
     def faded(self) -> bool:
-        """Whether the drive was stopped, and has faded out on the device."""
+        """Whether the drive was stopped, and has faded out on the device; or it plays no more."""
         driver = self.rendering.driver
-        return 0 <= self._stopped <= self._next - FADE_OUT * driver.rate - driver.delay
+        return self._short or 0 <= self._stopped <= self._next - FADE_OUT * driver.rate - driver.delay
 
     def fault(self) -> DeviceFault | None:
         """Return why the drive was stopped, if it was."""
-        if self._stopped < 0:
-            return None
         stated = getattr(self.rendering.driver, "fault", None)
         if isinstance(stated, DeviceFault):
-            stated.time = self._stopped / self.rendering.driver.rate
+            stated.time = (self._next if self._stopped < 0 else self._stopped) / self.rendering.driver.rate
             return stated
+        if self._stopped < 0:
+            return None
         return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
     def _exchange(self, position: Array, load: Array) -> None:

@@ -33,7 +33,7 @@ from hapticrender.errors import DeviceTimeout, HapticError, WatchdogTimeout, not
 from hapticrender.jit import Addressed
 from hapticrender.live_loop import LiveLoop, LiveMotion
 from hapticrender.live_threads import LiveThreads, foresee, hold_to_clock
-from hapticrender.loop import FADE_OUT, differences, opened, play_zeros, prepare, recorder_of, warn_of
+from hapticrender.loop import FADE_OUT, differences, import_early, opened, play_zeros, prepare, recorder_of, warn_of
 from hapticrender.player_scene import scenes_of
 from hapticrender.player_state import BandState, PlayerState
 from hapticrender.process_signals import stopped_by_signal
@@ -348,6 +348,7 @@ class Player(Addressed):
 
     def _start(self, rendering: Rendering, others: list[Scene]) -> list[Rendering]:
         """Open the device at rest, probe it, prepare what plays later, and play."""
+        import_early()
         device: Any = rendering.device
         stack, calls_back = self._stack, hasattr(device, "start")
         own = rendering.driver is device and hasattr(device, "loop")
@@ -405,8 +406,7 @@ class Player(Addressed):
         loop = self._loop
         left = max(round(seconds * loop.driver.rate / loop.driver.block), 1) * loop.driver.block
         while left > 0 and not self._stopping.is_set():
-            with stopped_by_signal(wait=True):  # else lost where compiled code calls a texture in Python
-                left -= self._block(most=left)
+            left -= self._block(most=left)
         with self._lock:
             self._watch()
             self._go_on()

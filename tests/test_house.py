@@ -384,18 +384,3 @@ def test_every_test_that_the_page_on_safety_names_is_there():
         elif word.startswith("..._"):
             pattern = re.escape(word).replace(re.escape("..."), ".*")
             assert [name for name in names if re.fullmatch(pattern, name)], f"{file.name}: {word}"
-
-
-def test_nothing_of_scipy_is_imported_while_a_device_plays():
-    """What functions import late stands in `load_ahead`, unless it is for files, designs or studies alone."""
-    late = {
-        node.module
-        for path in MODULES.values()
-        for function in ast.walk(tree_of(path))
-        if isinstance(function, ast.FunctionDef)
-        for node in ast.walk(function)
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("scipy")
-    }
-    functions = {getattr(each, "name", ""): each for each in tree_of(MODULES["hapticrender.loop"]).body}
-    loaded = {node.value for node in ast.walk(functions["load_ahead"]) if isinstance(node, ast.Constant)}
-    assert late - loaded == {"scipy.io", "scipy.linalg"}

@@ -159,7 +159,8 @@ class Scene(Validated):
         self.device_profile  # noqa: B018 (it refuses what is no limit, and no calibration)
         self.panel  # noqa: B018 (it refuses what is no touch panel)
         if isinstance(self.finger.motion, Nowhere) and getattr(self.texture, "spatial", False):
-            raise ValueError("finger.motion = 'none': a texture over position needs a finger")
+            cure = "give [finger], or Player(finger=...)"
+            raise ValueError(f"finger.motion = 'none': a texture over position needs a finger: {cure}")
 
     @property
     def device_profile(self) -> DeviceProfile:
