@@ -294,7 +294,7 @@ def test_what_ends_an_application_ends_in_zero_drive_with_a_flag_within_10_ms(en
 def test_zero_drive_does_not_wait_for_a_long_call_of_another_thread(end, monkeypatch):
     """`state`, which takes a second for 512 bands, here 0.5 s as long as it waits; the clock goes on meanwhile."""
     cause, error = ENDS[end]
-    driver, under_way = OtherPlate(), threading.Event()
+    driver, under_way = OtherPlate(rate=2500.0), threading.Event()  # half the time of a processor
     driver.probe, first = False, 0
 
     def figures(loop):
