@@ -63,23 +63,23 @@ class LiveMotion:
 
     def __init__(self) -> None:
         self._clock = 0.0  # s
-        self._last = (0.0, math.nan, 0.0, 0.0)  # since (s), position, velocity, load
-        self._left = (0.0, 0.0)  # m: distance to catch up at `since`, behind both poles and behind the first one
+        # since (s), position, velocity, load; distance to catch up then (m), behind both poles and behind the first one
+        self._last = (0.0, math.nan, 0.0, 0.0, 0.0, 0.0)  # replaced as a whole: another thread reads it
 
     def update(self, position: float, velocity: float, load: float) -> None:
         """Set the finger (m, m/s, N)."""
-        since, place, before, _ = self._last
+        since, place, before, _, both, first = self._last
         passed = max(self._clock - since, 0.0)
         jump = place + before * min(passed, HORIZON) - position
-        constants, both, first = min(passed / CATCH_UP, MOST_CONSTANTS), *self._left
+        constants = min(passed / CATCH_UP, MOST_CONSTANTS)
         decay = math.exp(-constants)
         both, first = (both + first * constants) * decay, first * decay
-        self._left = (both + jump, first + jump) if math.isfinite(jump) else (0.0, 0.0)
-        self._last = (self._clock, position, velocity, load)
+        left = (both + jump, first + jump) if math.isfinite(jump) else (0.0, 0.0)
+        self._last = (self._clock, position, velocity, load, *left)
 
     def position(self, time: Array) -> Array:
         """Position (m) at `time` (s): at the last velocity, for `HORIZON` at most."""
-        time, (since, place, velocity, _), (both, first) = np.asarray(time, float), self._last, self._left
+        time, (since, place, velocity, _, both, first) = np.asarray(time, float), self._last
         self._clock = float(time[-1]) if time.size else self._clock
         passed = np.maximum(time - since, 0.0)
         constants = np.minimum(passed / CATCH_UP, MOST_CONSTANTS)
