@@ -79,20 +79,40 @@ def advance(z, drive, touch, plate, finger, step, substeps, truth):
 
     `touch` (n + 1, 3) holds position, load and contact at the samples.
     """
-    k, w = np.empty((4, 8)), np.empty(8)
+    k, w, at = np.empty((4, 8)), np.empty(8), np.empty(3)
     for n in range(len(drive)):
         p = touch[n, 0]
         truth[n] = z[0] + p * z[1] + bar(p) * z[2], z[0] - REACH * z[1] + z[2], z[0] + REACH * z[1] + z[2], 0.0
         truth[n, 3] = z[0] + bar(0.0) * z[2]
-        change = touch[n + 1] - touch[n]
         for j in range(substeps):
             for i in range(4):
-                w[:] = z
-                if i:
-                    w += (step if i == 3 else step / 2) * k[i - 1]
-                at = touch[n] + change * ((j + (0.0, 0.5, 0.5, 1.0)[i]) / substeps)
+                for m in range(8):  # loops: an expression of arrays takes new memory for each of its parts
+                    w[m] = z[m] + (step if i == 3 else step / 2) * k[i - 1, m] if i else z[m]
+                for m in range(3):
+                    at[m] = touch[n, m] + (touch[n + 1, m] - touch[n, m]) * ((j + (0.0, 0.5, 0.5, 1.0)[i]) / substeps)
                 slope(w, drive[n, 0], drive[n, 1], at[0], at[1], at[2], plate, finger, k[i])
-            z += step / 6 * (k[0] + 2 * k[1] + 2 * k[2] + k[3])
+            for m in range(8):
+                z[m] += step / 6 * (k[0, m] + 2 * k[1, m] + 2 * k[2, m] + k[3, m])
+
+
+@numba.njit(cache=True)
+def play_block(z, held, courses, first, lag, plate, finger, step, substeps, noise, sensors, truth, contact, report):
+    """Advance by a block from sample `first` on; return what is sensed (n, 2).
+
+    `courses` are from sample -`lag` on; `noise` (n, 2); `sensors`: their gains and step (m, 0: ideal), over 2 mm;
+    `report` (2, n): the finger's position and load as they are told.
+    """
+    touch, sensed = courses[first + lag :], noise.copy()
+    advance(z, held, touch, plate, finger, step, substeps, truth)
+    for n in range(len(held)):
+        for i in range(2):
+            shown = truth[n, 1 + i] * sensors[i] + sensed[n, i]
+            if sensors[2] > 0.0:
+                shown = min(max(sensors[2] * np.rint(shown / sensors[2]), -1e-3), 1e-3)
+            sensed[n, i] = shown
+        contact[n], touching = touch[n, 2], courses[first + n, 2] > 0.0
+        report[0, n], report[1, n] = (touch[n, 0], touch[n, 1]) if touching else (np.nan, 0.0)
+    return sensed
 
 
 class StrangersPlate:
@@ -136,7 +156,7 @@ class StrangersPlate:
         self._touch = [self._course(each) for each in (position, load, contact)]
         self._lag, self._substeps = round(report_lag * rate), substeps or (6 if rate < 20e3 else 2)
         self._queue, self._at, self._courses = np.zeros((late, 2)), 0, np.empty((0, 3))  # courses: from -lag on
-        self._rng, self._drawn = np.random.default_rng(seed), []
+        self._rng, self._noise = np.random.default_rng(seed), []
         self._z, self._truth, self._contact = self._equilibrium(), [], []
 
     @classmethod
@@ -170,28 +190,27 @@ class StrangersPlate:
 
     def _equilibrium(self):
         """State in which nothing moves before the first sample."""
-        touch, rest, z = self._touched(0, 0), np.zeros(8), np.zeros(8)
-        if not touch[0, 2]:
+        touch, rest, z = self._touched(0)[self._lag], np.zeros(8), np.zeros(8)
+        if not touch[2]:
             return z
-        slope(z, 0.0, 0.0, *touch[0], self._plate, self._finger, rest)
+        slope(z, 0.0, 0.0, *touch, self._plate, self._finger, rest)
         jacobian = np.zeros((4, 4))
         for i in range(4):
             unit, out = np.zeros(8), np.zeros(8)
             unit[i] = 1.0
-            slope(unit, 0.0, 0.0, *touch[0], self._plate, self._finger, out)
+            slope(unit, 0.0, 0.0, *touch, self._plate, self._finger, out)
             jacobian[:, i] = out[4:] - rest[4:]
         free = np.flatnonzero(jacobian.any(axis=1))  # without bending or phalanx their rows are zero
         z[free] = np.linalg.solve(jacobian[np.ix_(free, free)], -rest[4 + free])
         return z
 
-    def _touched(self, first, last):
-        """Position, load and contact at the samples from `first` to `last` inclusive."""
-        first, last = first + self._lag, last + self._lag
-        while last >= len(self._courses):  # a second and more at a time
+    def _touched(self, last):
+        """Position, load and contact at the samples from -lag to `last` and beyond."""
+        while last + self._lag >= len(self._courses):  # a second and more at a time
             n = len(self._courses) - self._lag + np.arange(round(self.rate) + self.block)
             more = np.stack([np.broadcast_to(each(n), n.shape) for each in self._touch], axis=1)
             self._courses = np.concatenate([self._courses, more])
-        return self._courses[first : last + 1]
+        return self._courses
 
     @property
     def truth(self):
@@ -199,12 +218,12 @@ class StrangersPlate:
 
         Of every sample played, as it was when that sample was sensed.
         """
-        return np.concatenate(self._truth)
+        return np.concatenate(self._truth).reshape(-1, 4)[: self._at]
 
     @property
     def contact(self):
         """Contact at every sample played, 0 to 1."""
-        return np.concatenate(self._contact)
+        return np.concatenate(self._contact).ravel()[: self._at]
 
     def __enter__(self):
         return self
@@ -216,24 +235,22 @@ class StrangersPlate:
         """Hold a block of drive (A), each row over a sample, and return what is sensed as each begins."""
         if self.drive_step:
             drive = np.clip(self.drive_step * np.round(drive / self.drive_step), -3.0, 3.0)
-        queue = np.concatenate([self._queue, drive])
-        held, self._queue = queue[: self.block], queue[self.block :]
-        first, last = self._at, self._at + self.block
-        touch, truth = self._touched(first, last), np.empty((self.block, 4))
-        step = 1 / (self.rate * self._substeps)
-        advance(self._z, held, touch, self._plate, self._finger, step, self._substeps, truth)
-        self._at = last
-        self._truth.append(truth)
-        self._contact.append(touch[:-1, 2])
-        sensed = truth[:, 1:3] * [self.true["gain_1"], self.true["gain_2"]]
-        if not len(self._drawn):  # a block at a time takes as long as the plate
-            self._drawn = list(self.noise * self._rng.standard_normal((DRAWN, *sensed.shape)))[::-1]
-        sensed += self._drawn.pop()
-        if self.sensor_step:
-            sensed = np.minimum(np.maximum(self.sensor_step * np.round(sensed / self.sensor_step), -1e-3), 1e-3)
-        touching = self._touched(first - self._lag, last - 1 - self._lag)[:, 2] > 0.0
-        position, load = np.where(touching, touch[:-1, 0], np.nan), np.where(touching, touch[:-1, 1], 0.0)
-        return hr.Sensed(sensed, position, normal_load=load)
+        if len(self._queue):
+            drive = np.concatenate([self._queue, drive])
+            drive, self._queue = drive[: self.block], drive[self.block :]
+        first, self._at = self._at, self._at + self.block
+        if not len(self._noise):  # a block at a time takes as long as the plate
+            shape = (DRAWN, self.block)
+            self._noise = list(self.noise * self._rng.standard_normal((*shape, 2)))[::-1]
+            self._truth.append(np.empty((*shape, 4)))
+            self._contact.append(np.empty(shape))
+        noise = self._noise.pop()
+        at, report = DRAWN - 1 - len(self._noise), np.empty((2, self.block))
+        courses, truth, contact = self._touched(self._at), self._truth[-1][at], self._contact[-1][at]
+        model = self._plate, self._finger, 1 / (self.rate * self._substeps), self._substeps
+        sensors = self.true["gain_1"], self.true["gain_2"], self.sensor_step
+        sensed = play_block(self._z, drive, courses, first, self._lag, *model, noise, sensors, truth, contact, report)
+        return hr.Sensed(sensed, report[0], normal_load=report[1])
 
 
 plate = StrangersPlate.of

@@ -96,7 +96,9 @@ class TouchMonitor:
         self._bins = bins[(hertz >= BAND[0]) & (hertz <= min(BAND[1], top))][::SPACING]
         self._window = np.hanning(self.length + 1)[:-1]
         self._variance = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit) ** 2  # of a sensor's noise (m2)
+        self._lines = np.r_[0, self._bins]
         self._noise = self._noise_density()
+        self._precision = 2.0 * np.linalg.inv(self._noise)  # of a complex number: half its variance is in its real part
         largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
         self._prior = np.diag(np.r_[np.repeat(largest, 3), DELAY_ERROR, 1.0, 1.0] ** -2.0)
         self._information, self._known = self._prior.copy(), np.zeros(len(self._prior))
@@ -164,7 +166,7 @@ class TouchMonitor:
     def _noise_density(self) -> Array:
         """Covariance of the force's spectrum by the sensors' noise, of 0 Hz and every bin, shape (bins + 1, 2, 2)."""
         model, power = self.model, float(np.sum(self._window**2))
-        turn = np.exp(2j * np.pi / self.length * np.multiply.outer(np.r_[0, self._bins], np.arange(TAPS)))
+        turn = np.exp(2j * np.pi / self.length * np.multiply.outer(self._lines, np.arange(TAPS)))
         h = turn @ self._filters.T
         terms = (model.stiffness, model.damping, model.mass)
         response = sum(h[:, k, None, None] * each for k, each in enumerate(terms)) @ model.coordinate_from_sensed
@@ -174,7 +176,7 @@ class TouchMonitor:
 
     def _spectrum(self, signal: Array) -> Array:
         """Hann-weighted spectrum at 0 Hz and at the bins, along the last axis."""
-        return np.fft.rfft(signal * self._window, axis=-1)[..., np.r_[0, self._bins]]
+        return np.fft.rfft(signal * self._window, axis=-1)[..., self._lines]
 
     def _force(self, parts: Array) -> Array:
         """Return f = B i - K q - C q' - M q'' in both coordinates, shape (2, length)."""
@@ -203,8 +205,7 @@ class TouchMonitor:
         moved = np.flatnonzero(abs(rows[0, 0]) ** 2 > LEAST_SIGNAL * quiet)
         moved = moved[moved > 0]
         rows, force = np.moveaxis(rows[:, :, moved], 2, 0), force[:, moved].T[:, :, None]
-        # half the variance of a complex number is in its real part: of both together 2/S
-        weighted = 2.0 * rows.conj().transpose(0, 2, 1) @ np.linalg.inv(self._noise[moved])
+        weighted = rows.conj().transpose(0, 2, 1) @ self._precision[moved]
         self._information = self._prior + KEPT * (self._information - self._prior) + (weighted @ rows).real.sum(axis=0)
         self._known = KEPT * self._known + (weighted @ force).real.sum(axis=0)[:, 0]
 
@@ -229,22 +230,27 @@ class TouchMonitor:
         fixed = float(self._known @ np.linalg.solve(self._information, self._known))
         for width in (1.0, 0.25, 0.0625):
             errors = best + spread * width * SEARCH
-            values = [self._value(across - d * along, rows[0] - d * rows[1], noise, mean + d) for d in errors]
-            totals = np.array(values) + (errors / spread) ** 2
+            left, per_error = across - errors[:, None] * along, rows[0] - errors[:, None, None] * rows[1]
+            totals = self._values(left, per_error, noise, mean + errors) + (errors / spread) ** 2
             best, statistic = float(errors[np.argmin(totals)]), fixed + float(totals.min())
         freedom = 2.0 * along.size - (1.0 if self._rest is not None else 0.0)  # at 0 Hz a number is real
         return TouchTest(statistic, freedom, bound_of(freedom), best / self.model.lever_per_metre)
 
-    def _value(self, left: Array, rows: Array, noise: Array, lever: float) -> float:
-        """T for one d, but for its terms without the data: least squares over the plate's errors and lateness."""
-        combine = np.array([-lever, 1.0])
-        variance = np.einsum("i,kij,j->k", combine, noise, combine)
+    def _values(self, left: Array, rows: Array, noise: Array, lever: Array) -> Array:
+        """T for each `lever` (e,), but for its terms without the data; `left` (e, bins), `rows` (e, errors, bins).
+
+        It is found by least squares over the plate's errors and lateness.
+        """
+        combine = np.stack([-lever, np.ones_like(lever)])
+        variance = np.einsum("ie,kij,je->ek", combine, noise, combine)
         weight = 2.0 / variance
-        if left.size > self._bins.size:
-            weight[0] = 1.0 / variance[0]
-        matrix = self._information + ((rows.conj() * weight) @ rows.T).real
-        vector = self._known + ((rows.conj() * weight) @ left).real
-        return float(np.sum(weight * abs(left) ** 2) - vector @ np.linalg.solve(matrix, vector))
+        if left.shape[1] > self._bins.size:
+            weight[:, 0] = 1.0 / variance[:, 0]
+        weighted = rows.conj() * weight[:, None]
+        matrix = self._information + (weighted @ rows.transpose(0, 2, 1)).real
+        vector = self._known[:, None] + (weighted @ left[:, :, None]).real
+        explained = (vector * np.linalg.solve(matrix, vector)).sum(axis=(1, 2))
+        return np.asarray((weight * abs(left) ** 2).sum(axis=1) - explained)
 
 
 def windows_under_touch(recording: Recording, model: DeviceModel) -> list[tuple[float, TouchTest]]:

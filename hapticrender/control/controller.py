@@ -238,4 +238,6 @@ def device_settings(model: DeviceModel) -> dict[str, Any]:
 
 def padded(matrix: Array, rows: int, columns: int) -> Array:
     """Matrix of shape (rows, columns) with zeros below and beside what is given."""
-    return np.pad(matrix, ((0, rows - matrix.shape[0]), (0, columns - matrix.shape[1])))
+    found = np.zeros((rows, columns))
+    found[: matrix.shape[0], : matrix.shape[1]] = matrix
+    return found

@@ -85,6 +85,7 @@ def share_driven(model: DeviceModel, frequency: Array) -> Array:
     return np.where(frequency > top, passed / np.maximum(omega, 1.0) ** 2, 1.0)
 
 
+@lru_cache
 def sample_fingers() -> tuple[Array, Array]:
     """Frequencies (Hz, shape (f,)) and dynamic stiffnesses z(j w) of `FINGERS` fingers (N/m, shape (FINGERS, f)).
 
