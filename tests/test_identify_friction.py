@@ -16,19 +16,19 @@ from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 
 
 class Screen(Bench):
-    """Friction mu (W + g I^2) over 11.5 um of sliding at 80 mm/s, to and fro; 1 mN of noise, a load that varies."""
+    """Friction mu (W + g I^2) over 11.5 um of sliding, to and fro; 1 mN of noise, a `load` W (N) that varies."""
 
     rate, block, delay, drive_channels, sensed_channels = 10e3, 10, 10, 1, 1
 
-    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, seed=0, unit=1.0, lateral=False, skin=0.0):
+    def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, load=0.5, seed=0, unit=1.0, lateral=False, skin=0.0):
         self.unit, self.lateral, self.skin, self.rough = unit, lateral, skin, 0.0
-        self.mu, self.gain, self.speed, self.at, self.friction = mu, gain, speed, 0, 0.0
+        self.mu, self.gain, self.speed, self.load, self.at, self.friction = mu, gain, speed, load, 0, 0.0
         self.rng = np.random.default_rng(seed)
 
     def play(self, drive):
         time = (self.at + np.arange(len(drive))) / self.rate
         self.at += len(drive)
-        load = 0.5 + 0.1 * np.sin(2 * np.pi * 1.3 * time)
+        load = self.load * (1.0 + 0.2 * np.sin(2 * np.pi * 1.3 * time))
         sensed = np.empty((len(drive), 1))
         for i, current in enumerate(drive[:, 0]):
             sensed[i] = self.friction + self.rough

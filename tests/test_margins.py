@@ -51,6 +51,13 @@ def test_margins_of_a_third_order_lag_in_closed_form(gain):
     assert found.stable
 
 
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_the_sensitivity_is_that_of_the_inverse(size, rng):
+    loop = rng.normal(size=(20, size, size)) + 1j * rng.normal(size=(20, size, size))
+    highest = np.linalg.norm(np.linalg.inv(np.eye(size) + loop), 2, axis=(1, 2))
+    assert sensitivity(loop) == pytest.approx(highest, rel=1e-9)
+
+
 def test_a_gain_that_may_not_fall_counts_as_well():
     """5 (s + 1)^2/s^3 is stable for gains above 1/2 (Routh), so it bears division by 10."""
     s = 2j * np.pi * GRID

@@ -10,7 +10,8 @@ from test_kernel import plate_controller, tones
 
 import hapticrender as hr
 from benchmarks.charts.poles import growth, loop_poles
-from benchmarks.charts.stability_map import loaded_plate
+from benchmarks.charts.stability import CASES
+from benchmarks.charts.stability_map import loaded_plate, polar_map
 from hapticrender.control.controller_design import ONE_SPEED, design_controller, rules_for
 from hapticrender.control.damping import damping_taps, oscillators
 from hapticrender.control.margin_check import OF_LOOP, SCHEDULE, STEPS, checked_settings, error_loop
@@ -205,6 +206,14 @@ def test_nyquists_count_agrees_with_the_poles(frequencies, level):
     for delay in (1, 8):
         loop = replace(error_loop(MODEL, at(*frequencies), SETTINGS, level, taps=TAPS), delay=delay)
         assert loop.margins().stable == (growth(loop) < 0.02), delay
+
+
+@pytest.mark.parametrize("common", [False, True])
+def test_a_slow_polar_loop_far_from_the_modes_is_robust(common):
+    """Its crossover is at the bandwidth of 1 Hz, where filters of 2 and 4 Hz lag: Ms is below 2."""
+    found = polar_map(CASES[0], common, np.array([40.0, 300.0]), np.array([1.0]))
+    assert (found.growth < 0.0).all()
+    assert (found.modulus > 0.5).all()
 
 
 def test_poles_and_frequency_response_are_of_one_loop():

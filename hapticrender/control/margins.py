@@ -144,10 +144,12 @@ def margins_of(loop: Callable[[Array], Array], grid: Array) -> Margins:
 
 
 def sensitivity(loop: Array) -> Array:
-    """Largest singular value of S = (I + L)^-1, shape (...), of `loop` (..., c, c), c 1 or 2."""
+    """Largest singular value of S = (I + L)^-1, shape (...), of `loop` (..., c, c)."""
     difference = np.eye(loop.shape[-1]) + loop
     if loop.shape[-1] == 1:
         return 1.0 / np.abs(difference[..., 0, 0])
+    if loop.shape[-1] > 2:  # that of a polar law in two coordinates has four
+        return 1.0 / np.linalg.svd(difference, compute_uv=False)[..., -1]
     size = (np.abs(difference) ** 2).sum(axis=(-2, -1))
     volume = np.abs(np.linalg.det(difference))
     return np.sqrt(0.5 * (size + np.sqrt(np.maximum(size**2 - 4 * volume**2, 0.0)))) / volume
