@@ -255,7 +255,8 @@ def test_an_application_behind_a_panel_is_within_the_budget(tmp_path, rng):
     assert np.sqrt(np.mean(error**2)) == pytest.approx(expected, rel=5 / np.sqrt(2 * independent))
 
 
-def test_the_finest_wavelength_has_the_phase_error_that_it_is_for():
-    panel = hr.TouchPanel(rate=120.0)
+@pytest.mark.parametrize("panel", PANELS.values(), ids=PANELS)
+def test_the_finest_wavelength_has_the_phase_error_that_it_is_for(panel):
+    """Without a warning of numbers that cannot be told apart, either, which an encoder's would be in SI units."""
     finest = hr.finest_wavelength(panel, 0.1)
     assert hr.phase_error(panel, 0.1, finest) == pytest.approx(30.0, rel=1e-3)

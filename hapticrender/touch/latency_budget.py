@@ -74,7 +74,8 @@ def position_error(
 
         a, b = _system(settled_gain(estimator, panel.rate, rms), step, late)
         turn = np.exp(1j * omega * step)
-        played, spread = np.linalg.solve(turn * np.eye(5) - a, turn * b), solve_discrete_lyapunov(a, np.outer(b, b))
+        played = np.linalg.solve(turn * np.eye(5) - a, turn * b)
+        spread = solve_discrete_lyapunov(a, np.outer(b, b), method="bilinear")  # the direct one warns of units
     shares = [1.0 - panel.dropouts]  # of the time, by the samples that were lost since the last one
     while shares[-1] * panel.dropouts > MOST_LOST:
         shares.append(shares[-1] * panel.dropouts)
