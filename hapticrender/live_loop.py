@@ -121,9 +121,9 @@ class LiveLoop(RealtimeEntry):
         self.rendering, self.driver, self.model = rendering, rendering.driver, rendering.model
         self._calls_back = bool(scales)
         offered = None if rendering.plant is None else getattr(self.driver, "device_loop", None)
-        self._closed = None if offered is None else offered(self)  # a simulated device's loop in compiled code
-        if self._closed is not None:
-            self._closed(0, lambda position: position[:0])  # compiled before anything is live
+        self._device_loop = None if offered is None else offered(self)  # a simulated device's loop in compiled code
+        if self._device_loop is not None:
+            self._device_loop(0, lambda position: position[:0])  # compiled before anything is live
         else:
             _ = self.address if scales else self.plain_address
         rows = len(self._arrays["log"])
@@ -137,8 +137,8 @@ class LiveLoop(RealtimeEntry):
         self._began = math.nan  # s: computing a piece of a texture
         self._foreseen: tuple[int, tuple[int, ...]] = (0, ())  # sample and state of the last `foresee`
         self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
-        self._reshaping: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
-        self._reshaped: tuple[Any, Any, int] | None = None  # the one that is done
+        self._shape_change: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
+        self._shape_changed: tuple[Any, Any, int] | None = None  # the one that is done
         real = rendering.plant is None
         self._touches = TouchWatch(rendering.model, self.controller, active=real, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
@@ -165,21 +165,21 @@ class LiveLoop(RealtimeEntry):
 
     def _advance(self, sensing: bool, flags: int, most: int) -> int:
         first = self.samples
-        if self._closed is None:
+        if self._device_loop is None:
             sensed = self._exchange(sensing, flags)
         else:
             count = most or max(round(TURN * self.rate), 1)
-            self._entry["given"], self._entry["lost"] = sensing, flags
+            self._entry["sensed_position"], self._entry["lost"] = sensing, flags
             with uninterrupted():
-                count = 1 if self._reshaping is not self._reshaped else count
-                sensed = self._closed(count, lambda position: np.zeros(len(position)))[-1]
+                count = 1 if self._shape_change is not self._shape_changed else count
+                sensed = self._device_loop(count, lambda position: np.zeros(len(position)))[-1]
         at = (first + np.arange(len(sensed.sensed))) % len(self._true)
         if sensed.motion is not None:
             self._true[at, :-1], self._has_motion = sensed.motion, True
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
         self.senses = sensed.position is not None
-        self._reshape()
+        self._change_shape()
         self._known = first + len(at)
         for texture in self._textures:
             if isinstance(texture, EvaluatedTexture) and texture.error is not None:
@@ -247,16 +247,16 @@ class LiveLoop(RealtimeEntry):
         slow = f"{PIECE:g} s of it took {took:.3g} s to compute, {took / PIECE:.3g} times as long as it lasts"
         return f"{name}: {slow}: it was not played to its end: compute it before play begins"
 
-    def _reshape(self) -> None:
+    def _change_shape(self) -> None:
         """Take the characteristic before the device over to that of the present texture, while it fades in."""
-        change = self._reshaping
-        if change is None or change is self._reshaped:
+        change = self._shape_change
+        if change is None or change is self._shape_changed:
             return
         before, shape, since = change
         share = min((self.samples - since + self.driver.block) / (FADE * self.driver.rate), 1.0)
         self._device.shape = shape.after(before, share)
         if share == 1.0:
-            self._reshaped = change
+            self._shape_changed = change
 
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
@@ -278,12 +278,12 @@ class LiveLoop(RealtimeEntry):
                 _widen(part, its_model)
         if controller is not self._control.controller:
             ready(controller)
-        with nullcontext() if self._closed is None else self._turn:  # a piece is played with one shape
+        with nullcontext() if self._device_loop is None else self._turn:  # a piece is played with one shape
             self.play(texture, controller)
             if rendering.shape is not None and hasattr(self._device, "reshape"):
                 self._device.reshape(rendering.shape)
             elif rendering.shape is not None:
-                self._reshaping = self._device.shape, rendering.shape, self.samples
+                self._shape_change = self._device.shape, rendering.shape, self.samples
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
         self.model = model
 

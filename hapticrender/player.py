@@ -103,7 +103,7 @@ class Player(Addressed):
         if watchdog not in (None, math.inf):
             watchdog = number("watchdog", watchdog, "s", least=2.0 * SERVICE, most=LONGEST_WATCHDOG)
         self._scene = scenes_of(device, finger, tables)  # what is not there is refused at once
-        self._given = isinstance(device, Scene)
+        self._of_scene = isinstance(device, Scene)
         self._driver, self._paced, self._watchdog = driver, flag("paced", paced), watchdog
         self._motion = LiveMotion()
         self._parts, self._until = deque[tuple[Rendering, float]](), math.inf  # the first plays until then (s)
@@ -242,7 +242,7 @@ class Player(Addressed):
                 raise ValueError(f"{path}: a recording is under way: call end_recording first")
             self._service()
             rendering = replace(loop.rendering, model=loop.model)
-            scene = rendering.scene if self._given else replace(rendering.scene, duration=SHORTEST)
+            scene = rendering.scene if self._of_scene else replace(rendering.scene, duration=SHORTEST)
             bands = replace(rendering.bands.select(np.zeros(0, int)), envelope=None, unfelt=())
             recorder = recorder_of(rendering, path, scene=scene, bands=bands)
             recorder.begin()
@@ -360,7 +360,7 @@ class Player(Addressed):
             raise ValueError("paced = False: must be True on a device with a clock of its own")
         scales = {name: getattr(device, name) for name in ("sensed_scale", "drive_scale")} if calls_back else {}
         loop: Any = device.loop(rendering) if own else LiveLoop(rendering, **scales)
-        if not self._given and rendering.plant is not None:
+        if not self._of_scene and rendering.plant is not None:
             self._motion.attach(rendering)
         stack.enter_context(opened(rendering.driver, device, self._threads.hanging.is_set))
         if rendering.probe is not None:
@@ -399,7 +399,7 @@ class Player(Addressed):
 
     def _block(self, late: bool = False, most: int = 0) -> int:
         """Play a block, see `LiveLoop.advance`."""
-        return self._loop.advance(self._given or self._finger is None, late, most)
+        return self._loop.advance(self._of_scene or self._finger is None, late, most)
 
     def _advance(self, seconds: float) -> None:
         """Play for so long in this thread."""
@@ -435,7 +435,7 @@ class Player(Addressed):
 
     def _point(self) -> None:
         """Send the position of the scene's finger to a device that does not sense it."""
-        if self._given and self._finger is None and not self._loop.senses:
+        if self._of_scene and self._finger is None and not self._loop.senses:
             finger, now = self._loop.rendering.scene.finger, self.time + np.array([0.0, INSTANT])
             (here, there), load = finger.position(now), finger.load(now)[0]
             self._loop.finger(here, float(np.nan_to_num((there - here) / INSTANT)), load)

@@ -177,7 +177,7 @@ class RealtimeEntry(Addressed):
         between = self.converter
         if between is None:
             arrays = {name: self._arrays[name] for name in ("drive", "sensed")}
-            self._conversion = record_of(CONVERSION, **arrays, played=arrays["drive"], given=arrays["sensed"])
+            self._conversion = record_of(CONVERSION, **arrays, played=arrays["drive"], raw=arrays["sensed"])
             return {"unit": self.controller.block, "hold": 1, "conversion": self._conversion}
         steps = {"sense": between.sense, "act": between.act}
         return {
@@ -235,7 +235,7 @@ class RealtimeEntry(Addressed):
         """
         sensed, drive = np.ascontiguousarray(sensed, float), np.empty((len(sensed), self.controller.channels))
         position = None if position is None else np.ascontiguousarray(position, float)
-        self._entry["given"] = 0 if position is None else position.ctypes.data
+        self._entry["sensed_position"] = 0 if position is None else position.ctypes.data
         self._entry["taken"], self._entry["lost"] = 0, flags
         PLAIN(sensed.ctypes.data, drive.ctypes.data, len(sensed), self.user_data)
         return drive

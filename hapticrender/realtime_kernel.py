@@ -60,7 +60,7 @@ _ADDRESSES = (
 _COUNTS = (
     "block sensors channels middle slot age samples flags refused lost ahead idle stopped timed_out taken hold unit"
 )
-_TEXTURE = "current previous switch changes finger_changes calls log_rows log_width given"
+_TEXTURE = "current previous switch changes finger_changes calls log_rows log_width sensed_position"
 _STATE = "gain touch place pace offset offset_input lead lead_input open level"
 _SETTINGS = "rate fade fade_out fade_in touch_step gain_smoothing offset_kept closing_step"
 ENTRY = np.dtype(
@@ -217,8 +217,8 @@ def follow_finger(entry, slot, m):
     """Where the finger is in sample m of the block, and where it will be at the end of the look-ahead (m)."""
     e, s = record(entry, ENTRY_T, 0), record(slot, SLOT_T, 0)
     position, ahead = carray(pointer(e.position_at, F8), e.block), e.ahead / e.rate
-    if e.given != 0:
-        position[m] = carray(pointer(e.given, F8), 1)[e.taken + m]
+    if e.sensed_position != 0:
+        position[m] = carray(pointer(e.sensed_position, F8), 1)[e.taken + m]
         c = record(e.tracker, CONTROLLER_T, 0)
         track_finger(c, position[m])
         there = position[m] + ahead * (c.velocity + 0.5 * ahead * c.acceleration)
@@ -235,7 +235,7 @@ def follow_finger(entry, slot, m):
     if touches:
         e.pace = position[m] - e.place if abs(position[m] - e.place) < JUMP else 0.0
         e.place = position[m]
-    fresh = e.given != 0 or e.age + m < HOLD * e.rate
+    fresh = e.sensed_position != 0 or e.age + m < HOLD * e.rate
     e.touch = min(max(e.touch + (e.touch_step if touches and fresh else -e.touch_step), 0.0), 1.0)
     return e.place, there if touches else e.place
 
@@ -398,14 +398,14 @@ def carry(entry, sensed, drive, frames, dtype, scaled):
         out[:] = 0.0
         return -1
     inputs, outputs = samples * e.sensors, samples * e.channels
-    source, given = carray(pointer(sensed, dtype), count * e.sensors), carray(pointer(c.given, F8), inputs)
+    source, raw = carray(pointer(sensed, dtype), count * e.sensors), carray(pointer(c.raw, F8), inputs)
     played = carray(pointer(c.played, F8), outputs)
     own, result = carray(pointer(e.sensed_at, F8), e.block * e.sensors), carray(pointer(e.drive_at, F8), 1)
     all_sensed, all_drive = carray(pointer(c.sensed, F8), e.unit * e.sensors), carray(pointer(c.drive, F8), 1)
     units, scales = carray(pointer(e.sensed_scale_at, F8), e.sensors), carray(pointer(e.drive_scale_at, F8), 1)
     for unit in range(count // samples):
         for i in range(inputs):
-            given[i] = source[unit * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
+            raw[i] = source[unit * inputs + i] * (units[i % e.sensors] if scaled else 1.0)
         if e.sense != 0:
             sense(entry)
         for first in range(0, e.unit, e.block):
@@ -436,12 +436,12 @@ def _audio(sensed, drive, frames, time, status, entry):
 
 @step
 def advance_simulated(entry, signals, first, n):
-    """Advance in the closed loop of a simulated device, whose own finger is used where `given` is not 0."""
+    """Advance in the closed loop of a simulated device, whose own finger is used where `sensed_position` is not 0."""
     e, s = record(entry, ENTRY_T, 0), record(signals, SIGNALS_T, 0)
     flags = carray(pointer(s.flags, I8), first + n)
     for m in range(first, first + n):
         e.lost |= flags[m]
-    e.given, e.taken = s.position if e.given != 0 else 0, first
+    e.sensed_position, e.taken = s.position if e.sensed_position != 0 else 0, first
     sensed, drive = s.sensed + 8 * first * e.sensors, s.drive + 8 * first * e.channels
     return carry(entry, sensed, drive, n, F8, False)
 

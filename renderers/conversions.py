@@ -61,9 +61,9 @@ def magnitude_sense(state, signals, start, count):
     """Take what is sensed as a magnitude."""
     r, io = record(state, ROOT_T, 0), record(signals, CONVERSION_T, 0)
     end = (start + count) * r.sensors
-    given, sensed = carray(pointer(io.given, F8), end), carray(pointer(io.sensed, F8), end)
+    raw, sensed = carray(pointer(io.raw, F8), end), carray(pointer(io.sensed, F8), end)
     for n in range(start * r.sensors, end):
-        sensed[n] = abs(given[n])
+        sensed[n] = abs(raw[n])
     return 0
 
 
@@ -100,7 +100,7 @@ RESONANT_T = numba.from_dtype(RESONANT)
 
 
 @kernel
-def jumps(r, given, start, count, lost):
+def jumps(r, raw, start, count, lost):
     """Whether the sensor has jumped: ``e = y_n - 2 cos(w T) y_n-1 + y_n-2`` is 0 in a steady vibration.
 
     A drive u adds N u T^2/m at most, and what decays w T/Q of the amplitude, 1/9 where a finger damps most.  A gain
@@ -114,7 +114,7 @@ def jumps(r, given, start, count, lost):
         bound = SIGMAS * max(r.stated, math.sqrt(r.noise_sum / r.counted)) + r.driven * peaks.max()
     before, last = (math.nan, math.nan) if lost else (r.before, r.last)
     for n in range(start, start + count):
-        y = given[n]
+        y = raw[n]
         change = abs(y - r.twice * last + before)
         if not unknown:
             size = math.sqrt(max(last * last + before * before - r.twice * last * before, 0.0)) / r.sine
@@ -142,11 +142,11 @@ def advance(r, io, start, count, lost):
     """Take the amplitude on by a piece of a block, whose samples are tested before any drive is computed from them."""
     end = start + count
     rows = (end - 1) // r.hold + 1
-    given, played = carray(pointer(io.given, F8), end), carray(pointer(io.played, F8), end)
+    raw, played = carray(pointer(io.raw, F8), end), carray(pointer(io.played, F8), end)
     drive, finger = carray(pointer(io.drive, F8), rows), carray(pointer(io.finger, F8), (rows, 2))
     sensed, flags = carray(pointer(io.sensed, F8), rows), carray(pointer(io.flags, I8), rows)
     r.samples += count
-    if r.sensors > 0 and r.jumped < 0 and jumps(r, given, start, count, lost):
+    if r.sensors > 0 and r.jumped < 0 and jumps(r, raw, start, count, lost):
         r.jumped = r.samples
     finger_damping = record(r.observed, CONTROLLER_T, 0).finger_damping
     decay, peak = amplitude_decay(r.free_damping, finger_damping, r.mass, r.period), 0.0
@@ -160,7 +160,7 @@ def advance(r, io, start, count, lost):
             if r.sensors > 0:
                 sensed[row] = r.friction
         flags[row] |= approach(r, k, decay)
-        r.sensed, r.flags = given[n] if r.sensors > 0 else 0.0, 0
+        r.sensed, r.flags = raw[n] if r.sensors > 0 else 0.0, 0
         call(r.controller, (r.controller_state, r.signals_at, 0, 1))
         played[n] = r.drive[0] if r.jumped < 0 else 0.0
         flags[row] |= r.flags if r.jumped < 0 else STOPPED

@@ -129,7 +129,7 @@ class ResonantDriver(WrappedDriver):
         for start in range(0, len(io["played"]), long):
             here = slice(start, start + long)
             played.append(check_sensed(self.driver, self.put(self._drive), 1))
-            io["given"][here], flags = played[-1].sensed, played[-1].flags
+            io["raw"][here], flags = played[-1].sensed, played[-1].flags
             self.conversion["lost"] = flags is not None and bool((flags & Flag.OVERRUN).any())
             resonant_sense(self.state.ctypes.data, self.conversion.ctypes.data, start, long)
             self._drive = io["played"][here].copy()

@@ -31,7 +31,7 @@ class Port:
 class WrappedDriver:
     """A driver whose drive or measurements are converted on the way; a subclass fills in `play`, by `put`, and steps.
 
-    Compiled steps convert: `act` makes `played` of the controller's drive, `sense` what the controller gets of `given`
+    Compiled steps convert: `act` makes `played` of the controller's drive, `sense` what the controller gets of `raw`
     (see `jit.CONVERSION`), from a `state`.  A `RealtimeEntry` takes the same steps where the device calls back, and
     refuses a driver that has none.  A sample of the controller is `hold` of the device.  While `resting` the device's
     own drive fades to zero: what zero drive of the controller becomes may be a bias.
@@ -52,13 +52,13 @@ class WrappedDriver:
         self.signals = {
             "drive": np.zeros((rows, self.drive_channels)),
             "played": np.zeros((long, self.drive_channels)),
-            "given": np.zeros((long, self.sensed_channels)),
+            "raw": np.zeros((long, self.sensed_channels)),
             "sensed": np.zeros((rows, self.sensed_channels)),
             "finger": np.zeros((rows, 2)),
             "flags": np.zeros(rows, np.int64),
         }
         if self.sense is None:
-            self.signals["sensed"] = self.signals["given"]
+            self.signals["sensed"] = self.signals["raw"]
         self.conversion = record_of(CONVERSION, **self.signals)
 
     def put(self, drive: Array) -> Sensed:
