@@ -47,7 +47,7 @@ TOUCH_FADE = 0.02  # s: of a function of position, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
 GAIN_TIME = 10e-3  # s
 CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers
-LOG_TIME = 2.0  # s: of signals that are kept
+LOG_TIME, LOG_MARGIN = 2.0, 0.05  # s: of signals that are kept; of those, what may be written anew while it is read
 BLOCK = ("sensed", "drive", "position", "waveform", "flags")  # signals of a block that all controllers share
 SAME = ("channels", "sensors", "block", "rate")  # of all controllers of an entry
 
@@ -329,7 +329,8 @@ class RealtimeEntry(Addressed):
         normal_load (N), reference (the whole texture) and flags, each shape (n,).
         """
         table, end = self._arrays["log"], self.samples
-        first = max(start, end - len(table) + 8 * self.controller.block + self.frames, 0)
+        margin = 8 * self.controller.block + self.frames + round(LOG_MARGIN * self.rate)
+        first = max(start, end - len(table) + margin, 0)
         rows = table[np.arange(first, end) % len(table)]
         c, s = self.controller.channels, self.controller.sensors
         played = np.arange(first, end) - self.frames  # the drive of a call plays with the samples of the next one
