@@ -47,9 +47,10 @@ SIGNALS = np.dtype(
 """Addresses of float64 arrays with a row a sample; `flags` is int64, `target` complex128 with a row a block."""
 SIGNALS_T = numba.from_dtype(SIGNALS)
 CONVERSION = np.dtype([(name, np.int64) for name in ("drive", "played", "raw", "sensed", "finger", "flags", "lost")])
-"""Addresses of what is converted between a controller and its device: its drive and what is played of it, what the
-device senses (`raw`) and what it gets of that (`sensed`), the finger's load (N) and speed (m/s, NaN while lifted), its
-flags; rows of `played` and `raw` are the device's samples.  `lost` says whether samples were lost before."""
+"""Addresses of what is converted between a controller and its device: the controller's drive and what the device plays
+for it, what the device senses (`raw`) and what the controller gets for that (`sensed`), the finger's load (N) and speed
+(m/s, NaN while lifted), the device's flags; rows of `played` and `raw` are the device's samples.  `lost` says whether
+samples were lost before."""
 CONVERSION_T = numba.from_dtype(CONVERSION)
 
 

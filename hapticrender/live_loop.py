@@ -138,7 +138,7 @@ class LiveLoop(RealtimeEntry):
         self._foreseen: tuple[int, tuple[int, ...]] = (0, ())  # sample and state of the last `foresee`
         self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
         self._shape_change: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
-        self._shape_changed: tuple[Any, Any, int] | None = None  # the one that is done
+        self._shape_done: tuple[Any, Any, int] | None = None  # the one that is done
         real = rendering.plant is None
         self._touches = TouchWatch(rendering.model, self.controller, active=real, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
@@ -169,9 +169,9 @@ class LiveLoop(RealtimeEntry):
             sensed = self._exchange(sensing, flags)
         else:
             count = most or max(round(TURN * self.rate), 1)
-            self._entry["sensed_position"], self._entry["lost"] = sensing, flags
+            self._entry["sensed_position"], self._entry["lost"] = sensing, flags  # any number, for the step's address
             with uninterrupted():
-                count = 1 if self._shape_change is not self._shape_changed else count
+                count = 1 if self._shape_change is not self._shape_done else count
                 sensed = self._device_loop(count, lambda position: np.zeros(len(position)))[-1]
         at = (first + np.arange(len(sensed.sensed))) % len(self._true)
         if sensed.motion is not None:
@@ -250,13 +250,13 @@ class LiveLoop(RealtimeEntry):
     def _change_shape(self) -> None:
         """Take the characteristic before the device over to that of the present texture, while it fades in."""
         change = self._shape_change
-        if change is None or change is self._shape_changed:
+        if change is None or change is self._shape_done:
             return
         before, shape, since = change
         share = min((self.samples - since + self.driver.block) / (FADE * self.driver.rate), 1.0)
         self._device.shape = shape.after(before, share)
         if share == 1.0:
-            self._shape_changed = change
+            self._shape_done = change
 
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""

@@ -47,7 +47,8 @@ TOUCH_FADE = 0.02  # s: of a function of position, at touch and lift
 JUMP_TIME = 5e-3  # s: a correction of the position decays by two poles of that time
 GAIN_TIME = 10e-3  # s
 CHANGE = 14e-3, 34e-3  # s: one texture fades out before, the other one in after the change of controllers
-LOG_TIME, LOG_MARGIN = 2.0, 0.05  # s: of signals that are kept; of those, what may be written anew while it is read
+LOG_TIME = 2.0  # s: of signals that are kept
+LOG_MARGIN = 0.05  # s: of these, what may be written anew while it is read; a simulated device plays 2 to 50 ms at once
 BLOCK = ("sensed", "drive", "position", "waveform", "flags")  # signals of a block that all controllers share
 SAME = ("channels", "sensors", "block", "rate")  # of all controllers of an entry
 
@@ -323,14 +324,14 @@ class RealtimeEntry(Addressed):
         self._set(playing=0)
 
     def log(self, start: int) -> dict[str, Array]:
-        """Signals from sample `start` on, as far back as they are kept (`LOG_TIME`).
+        """Signals from sample `start` on, as far back as they are kept: `LOG_TIME`, less what may be written meanwhile.
 
         `first` (the first sample), drive (n, channels) as it plays with a sample, sensed (n, sensors), position (m),
         normal_load (N), reference (the whole texture) and flags, each shape (n,).
         """
         table, end = self._arrays["log"], self.samples
         margin = 8 * self.controller.block + self.frames + round(LOG_MARGIN * self.rate)
-        first = max(start, end - len(table) + margin, 0)
+        first = max(start, min(max(end - len(table) + margin, 0), end))
         rows = table[np.arange(first, end) % len(table)]
         c, s = self.controller.channels, self.controller.sensors
         played = np.arange(first, end) - self.frames  # the drive of a call plays with the samples of the next one

@@ -233,6 +233,8 @@ class StrangersPlate:
 
     def play(self, drive):
         """Hold a block of drive (A), each row over a sample, and return what is sensed as each begins."""
+        if np.shape(drive) != (self.block, 2):
+            raise ValueError(f"drive of shape {np.shape(drive)}: must be {(self.block, 2)}")
         if self.drive_step:
             drive = np.clip(self.drive_step * np.round(drive / self.drive_step), -3.0, 3.0)
         if len(self._queue):

@@ -24,7 +24,7 @@ from hapticrender.mathx import smoothstep
 from hapticrender.plants.electroadhesion import SquareRoot
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Flag
-from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
+from hapticrender.realtime_entry import GAIN_TIME, JUMP_TIME, LOG_MARGIN, LOG_TIME, SLOTS, TOUCH_FADE, RealtimeEntry
 from hapticrender.realtime_kernel import ENTRY, HOLD, HORIZON, JUMP, MIDDLE_AT, swap
 from hapticrender.renderers.shaped import Port, ShapedDriver
 from hapticrender.sampled_texture import AHEAD, FADE, FRESH, SampledTexture, publish
@@ -206,6 +206,14 @@ def test_what_lies_along_the_surface_fades_out_without_updates_and_what_lies_in_
         assert abs(log[round(0.1 * RATE) : round(HOLD * RATE)]).max() > 3e-6
         assert (abs(log[-100:]).max() > 3e-6) == goes_on
         assert goes_on or abs(log[-100:]).max() == 0.0
+
+
+def test_the_log_leaves_out_what_may_be_written_while_it_is_read():
+    entry, kept = RealtimeEntry(designed(False, True)), (LOG_TIME - LOG_MARGIN) * RATE
+    for _ in range(round(1.5 * LOG_TIME * RATE / 100)):
+        plain(entry, np.zeros((100, 2)))
+    assert kept - 100 < entry.samples - entry.log(0)["first"] <= kept
+    assert entry.log(entry.samples - 10)["first"] == entry.samples - 10
 
 
 def test_a_program_that_hangs_fades_a_texture_in_time_out_and_back_without_a_step():

@@ -208,10 +208,9 @@ def test_nyquists_count_agrees_with_the_poles(frequencies, level):
         assert loop.margins().stable == (growth(loop) < 0.02), delay
 
 
-@pytest.mark.parametrize("common", [False, True])
-def test_a_slow_polar_loop_far_from_the_modes_is_robust(common):
+def test_a_slow_polar_loop_far_from_the_modes_is_robust():
     """Its crossover is at the bandwidth of 1 Hz, where filters of 2 and 4 Hz lag: Ms is below 2."""
-    found = polar_map(CASES[0], common, np.array([40.0, 300.0]), np.array([1.0]))
+    found = polar_map(CASES[0], False, np.array([40.0, 300.0]), np.array([1.0]))
     assert (found.growth < 0.0).all()
     assert (found.modulus > 0.5).all()
 

@@ -98,7 +98,7 @@ class TouchMonitor:
         self._variance = max(model.sensed_noise, LEAST_NOISE * model.sensed_limit) ** 2  # of a sensor's noise (m2)
         self._lines = np.r_[0, self._bins]
         self._noise = self._noise_density()
-        self._precision = 2.0 * np.linalg.inv(self._noise)  # of a complex number: half its variance is in its real part
+        self._precision = 2.0 * np.linalg.inv(self._noise[1:])  # of complex numbers: half the variance in the real part
         largest = [error * abs(getattr(model, name)).max() for name, error in ERRORS.items()]
         self._prior = np.diag(np.r_[np.repeat(largest, 3), DELAY_ERROR, 1.0, 1.0] ** -2.0)
         self._information, self._known = self._prior.copy(), np.zeros(len(self._prior))
@@ -205,7 +205,7 @@ class TouchMonitor:
         moved = np.flatnonzero(abs(rows[0, 0]) ** 2 > LEAST_SIGNAL * quiet)
         moved = moved[moved > 0]
         rows, force = np.moveaxis(rows[:, :, moved], 2, 0), force[:, moved].T[:, :, None]
-        weighted = rows.conj().transpose(0, 2, 1) @ self._precision[moved]
+        weighted = rows.conj().transpose(0, 2, 1) @ self._precision[moved - 1]
         self._information = self._prior + KEPT * (self._information - self._prior) + (weighted @ rows).real.sum(axis=0)
         self._known = KEPT * self._known + (weighted @ force).real.sum(axis=0)[:, 0]
 

@@ -148,7 +148,7 @@ def sensitivity(loop: Array) -> Array:
     difference = np.eye(loop.shape[-1]) + loop
     if loop.shape[-1] == 1:
         return 1.0 / np.abs(difference[..., 0, 0])
-    if loop.shape[-1] > 2:  # that of a polar law in two coordinates has four
+    if loop.shape[-1] > 2:  # the real form of a polar loop in two coordinates has four
         return 1.0 / np.linalg.svd(difference, compute_uv=False)[..., -1]
     size = (np.abs(difference) ** 2).sum(axis=(-2, -1))
     volume = np.abs(np.linalg.det(difference))
