@@ -96,23 +96,26 @@ def advance(z, drive, touch, plate, finger, step, substeps, truth):
 
 
 @numba.njit(cache=True)
-def play_block(z, held, courses, first, lag, plate, finger, step, substeps, noise, sensors, truth, contact, report):
-    """Advance by a block from sample `first` on; return what is sensed (n, 2).
-
-    `courses` are from sample -`lag` on; `noise` (n, 2); `sensors`: their gains and step (m, 0: ideal), over 2 mm;
-    `report` (2, n): the finger's position and load as they are told.
-    """
-    touch, sensed = courses[first + lag :], noise.copy()
-    advance(z, held, touch, plate, finger, step, substeps, truth)
-    for n in range(len(held)):
+def sense(truth, noise, sensors):
+    """What is sensed (n, 2) of the `truth`, with `noise`; `sensors`: gains and step (m, 0: ideal), over 2 mm."""
+    sensed = np.empty(noise.shape)
+    for n in range(len(noise)):
         for i in range(2):
-            shown = truth[n, 1 + i] * sensors[i] + sensed[n, i]
+            shown = truth[n, 1 + i] * sensors[i] + noise[n, i]
             if sensors[2] > 0.0:
                 shown = min(max(sensors[2] * np.rint(shown / sensors[2]), -1e-3), 1e-3)
             sensed[n, i] = shown
-        contact[n], touching = touch[n, 2], courses[first + n, 2] > 0.0
-        report[0, n], report[1, n] = (touch[n, 0], touch[n, 1]) if touching else (np.nan, 0.0)
     return sensed
+
+
+@numba.njit(cache=True)
+def report(touch, late):
+    """Positions and loads as they are told, (n,) each, of `touch` at n samples and of what was `late` before."""
+    position, load = np.full(len(touch), np.nan), np.zeros(len(touch))
+    for n in range(len(touch)):
+        if late[n, 2] > 0.0:
+            position[n], load[n] = touch[n, 0], touch[n, 1]
+    return position, load
 
 
 class StrangersPlate:
@@ -247,12 +250,14 @@ class StrangersPlate:
             self._truth.append(np.empty((*shape, 4)))
             self._contact.append(np.empty(shape))
         noise = self._noise.pop()
-        at, report = DRAWN - 1 - len(self._noise), np.empty((2, self.block))
-        courses, truth, contact = self._touched(self._at), self._truth[-1][at], self._contact[-1][at]
-        model = self._plate, self._finger, 1 / (self.rate * self._substeps), self._substeps
-        sensors = self.true["gain_1"], self.true["gain_2"], self.sensor_step
-        sensed = play_block(self._z, drive, courses, first, self._lag, *model, noise, sensors, truth, contact, report)
-        return hr.Sensed(sensed, report[0], normal_load=report[1])
+        at, courses = DRAWN - 1 - len(self._noise), self._touched(self._at)
+        touch, truth = courses[first + self._lag :], self._truth[-1][at]
+        step = 1 / (self.rate * self._substeps)
+        advance(self._z, drive, touch, self._plate, self._finger, step, self._substeps, truth)
+        self._contact[-1][at] = touch[: self.block, 2]
+        sensed = sense(truth, noise, (self.true["gain_1"], self.true["gain_2"], self.sensor_step))
+        position, load = report(touch[: self.block], courses[first:])
+        return hr.Sensed(sensed, position, normal_load=load)
 
 
 plate = StrangersPlate.of
