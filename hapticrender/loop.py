@@ -308,6 +308,7 @@ class _Loop:
         self.step = driver.block * max(int(piece * driver.rate / driver.block), 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
+        self._read_by_block = getattr(rendering.scene.texture, "spatial", True)  # else it is a function of time alone
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_length)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
@@ -330,9 +331,10 @@ class _Loop:
         finger, block = self.rendering.scene.finger, self.rendering.driver.block
         time = self._time(-(-count // block) * block)  # whole blocks: a motion may end with the scene
         position, load = finger.position(time), finger.load(time)
+        reference = None if self._read_by_block else self._reference(position)  # of the piece, as no driver changes it
         for first in range(0, count, block):
-            self._start = start + first
-            self._exchange(position[first : first + block], load[first : first + block])
+            self._start, here = start + first, slice(first, first + block)
+            self._exchange(position[here], load[here], None if reference is None else reference[here])
             if self.faded:
                 break
 
@@ -380,10 +382,11 @@ class _Loop:
             return None
         return device_fault(self.rendering, None if self._itself else self.controller, self._stopped, self._recent)
 
-    def _exchange(self, position: Array, load: Array) -> None:
+    def _exchange(self, position: Array, load: Array, reference: Array | None) -> None:
         """Exchange a block with the driver; the drive computed from it is played with the next one.
 
-        `position` and `load` are the finger's by the scene, for a driver that states none.
+        `position` and `load` are the finger's by the scene, for a driver that states none; `reference` is None where it
+        is read at the position.
         """
         driver: Any = self.rendering.driver
         played = self._drive
@@ -399,7 +402,8 @@ class _Loop:
         if sensed.flags is not None and hasattr(device, "host_delay") and hasattr(self.controller, "unplayed"):
             device_delay = self.rendering.model.delay - device.host_delay
             self.controller.unplayed(device_delay + np.flatnonzero(sensed.flags & Flag.OVERRUN))
-        self._drive, target, flags = self.controller.run(sensed.sensed, position, self._reference(position))
+        reference = self._reference(position) if reference is None else reference
+        self._drive, target, flags = self.controller.run(sensed.sensed, position, reference)
         flags = flags if sensed.flags is None else flags | sensed.flags
         self._keep(played, target, flags, Sensed(sensed.sensed, position, sensed.motion, load))
 

@@ -60,7 +60,12 @@ class Sensed(NamedTuple):
 
 @runtime_checkable
 class Texture(Protocol):
-    """A reference waveform: a function of time (s) or of the finger's position (m)."""
+    """A reference waveform: a function of time (s) or of the finger's position (m).
+
+    A texture may have ``spatial``, whether it is read at the finger's position.  One that is False there, a function of
+    time alone, is read a piece of many blocks at once; others a block at a time, when the driver has said where the
+    finger is.
+    """
 
     def bands(self, rate: float) -> Bands:
         """Carriers, and constant envelopes where the texture has them, for sampling at `rate` (Hz).

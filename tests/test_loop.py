@@ -256,3 +256,35 @@ def test_a_motion_may_end_with_the_last_block():
     motion = type("Ends", (), {"position": lambda self, time: places[np.rint(5000.0 * time).astype(int)]})()
     scene = hr.Scene(texture=TONE.texture, finger=hr.Finger(motion, 0.3), duration=0.21)
     assert len(hr.render(scene, driver=StrangersPlate())) == 1050
+
+
+class Counted:
+    """A recording as a texture of somebody else's, which keeps how many samples it was read at."""
+
+    def __init__(self, recorded):
+        self.recorded, self.read = recorded, []
+
+    def bands(self, rate):
+        return self.recorded.bands(rate)
+
+    def waveform(self, time, position):
+        self.read.append(len(time))
+        return self.recorded.waveform(time, position)
+
+
+class InTime(Counted):
+    spatial = False
+
+
+def test_a_function_of_time_is_read_ahead_of_the_driver_and_any_other_block_by_block():
+    noise = np.random.default_rng(1).standard_normal(2000)
+    runs, reads = [], []
+    for kind in (Counted, InTime):
+        texture = kind(hr.Recorded(samples=noise, rate=5000.0, amplitude=5e-6))
+        scene = hr.Scene(texture=texture, finger=SPATIAL.finger, duration=0.2)
+        rendering = hr.prepare(scene, driver=simulated(scene, kind=Blocks))
+        texture.read.clear()
+        runs.append(hr.run(rendering))
+        reads.append(texture.read.count(1))
+    equal(*runs)
+    assert reads == [1000, 0]
