@@ -39,10 +39,15 @@ def study(subject, plate):
 
 
 def main(plate="rigid", count=40, seed=1):
-    """Print the worst errors of a population, and the standard errors of the impedance by band."""
+    """Print the errors of a population."""
     subjects = population(int(count), int(seed))
-    each = [study(subject, plate) for subject in subjects]
-    print(f"{plate}, {count} subjects; one touch found in {sum(one.touches == 1 for one in each)}")
+    print(f"{plate}:")
+    show(subjects, [study(subject, plate) for subject in subjects])
+
+
+def show(subjects, each):
+    """Print the worst of their errors, and the standard errors of the impedance by band."""
+    print(f"{len(subjects)} subjects; one touch found in {sum(one.touches == 1 for one in each)}")
     print(f"edges of contact: worst {1e3 * max(one.edge for one in each):.1f} ms (bound 10)")
     print(f"load: worst {max(one.load.max() for one in each):.2f} of 5 % or 20 mN")
     position = 1e3 * max(one.position.max(initial=0.0) for one in each)
@@ -59,11 +64,14 @@ def main(plate="rigid", count=40, seed=1):
     sure = 3 * relative < 0.1
     windows = f"{sure.sum()} windows whose 3 standard errors are below 10 %"
     print(f"within 10 % and 10 degrees: {100 * near[sure].mean():.1f} % of the {windows}")
-    rows = [["band (Hz)", "inside one", "two", *(f"{low:g}-{high:g} N" for low, high in LOADS)]]
-    loads = np.array([subject.load for subject in subjects])
+    by_load = {
+        f"{low:g}-{high:g} N": group
+        for low, high in LOADS
+        if (group := [one for one, subject in zip(each, subjects, strict=True) if low <= subject.load < high])
+    }
+    rows = [["band (Hz)", "inside one", "two", *by_load]]
     for k, frequency in enumerate(FREQUENCIES):
-        chosen = [np.flatnonzero((loads >= low) & (loads < high)) for low, high in LOADS]
-        medians = [np.nanmedian(np.concatenate([each[i].relative[:, k] for i in group])) for group in chosen]
+        medians = [np.nanmedian(np.concatenate([one.relative[:, k] for one in group])) for group in by_load.values()]
         inside = [np.mean(parts[:, :, k][good[:, :, k]] < times) for times in (1, 2)]
         rows.append([f"{frequency:g}", *(f"{100 * value:.1f} %" for value in (*inside, *medians))])
     print("standard error / |Z| by load, medians:")

@@ -109,6 +109,7 @@ class Subject:
             velocity=found.velocity.value[at] - speed,  # m/s
             impedance=(z.value - truth) / z.standard_error,  # in standard errors
             relative=z.standard_error / np.abs(truth),
+            ratio=z.value / truth,
         )
 
 

@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from subjects import OFF, ON, Subject, population
+from subjects import FREQUENCIES, OFF, ON, Subject, population
 from test_analysis_plate import open_loop
 
 import hapticrender as hr
+from benchmarks.finger_accuracy import show
 from hapticrender.analysis.records import DOUBTFUL, LOADED
 from hapticrender.analysis.smoothing import spread_of
 from hapticrender.drivers.simulated import SimulatedDriver
@@ -77,6 +78,15 @@ def test_standard_errors_are_right(studied):
     assert counts["impedance"] > 1000
     assert all(counts[name] > 150 for name in counts)
     assert all(0.60 < share < 0.76 for share in shares.values()), shares
+
+
+def test_the_published_figures_are_printed(studied, capsys):
+    errors = [subject.errors(recording, found) for subject, recording, found in studied]
+    show([subject for subject, _, _ in studied], errors)
+    out = capsys.readouterr().out
+    assert f"worst {max(one.load.max() for one in errors):.2f} of 5 % or 20 mN" in out
+    rows = [line.split()[0] for line in out[out.index("standard error / |Z|") :].splitlines()]
+    assert [f"{frequency:g}" for frequency in FREQUENCIES] == rows[-len(FREQUENCIES) :]
 
 
 def test_a_finger_on_a_third_party_s_plate_is_measured_as_well():
