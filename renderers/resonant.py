@@ -111,10 +111,8 @@ class ResonantDriver(WrappedDriver):
 
     def calibrate(self, device: Driver) -> None:
         """Probe the open `device`, and correct the force per volt in the amplitude's loop by the gain found."""
-        mode = self.parameters.carrier_mode
-        gain = probe_resonance(device, mode)
-        self.loop.settings["drive_from_force"][0, 0] = 1.0 / (gain * mode.force_constant)
-        self.state["slew"] = gain * full_slew(mode)
+        mode = self.parameters.mode
+        self.loop.settings["drive_from_force"][0, 0] = 1.0 / (probe_resonance(device, mode) * mode.force_constant)
 
     @property
     def fault(self) -> Fault | None:
