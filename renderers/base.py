@@ -75,7 +75,7 @@ class BaseRenderer:
             controller=partial(design, bands),
             design=design,
             shape=self.shape(setup),
-            probe=self.probe(setup, model, device),
+            probe=self.probe(setup, model, facing),
             board_law=partial(self.board_law, setup),
         )
 
@@ -131,7 +131,7 @@ class BaseRenderer:
         return model
 
     def probe(self, setup: Setup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes the open device before the loop closes; None where nothing does."""
+        """Return what probes the open device behind `driver` before the loop closes; None where nothing does."""
         return None
 
     def board_law(self, setup: Setup) -> str:

@@ -11,6 +11,7 @@ from hapticrender.checks import require
 from hapticrender.control.controller import BankController
 from hapticrender.control.device_model import Demand
 from hapticrender.control.methods import method_named
+from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.control.supervisor import JUMP, Fault, supervised
 from hapticrender.driver_checks import check_channels, check_sensed
 from hapticrender.jit import record_of
@@ -107,6 +108,11 @@ class ResonantDriver(WrappedDriver):
             state["signals"][name] = state[name].ctypes.data
         state["signals_at"] = state["signals"].ctypes.data
         return state
+
+    def calibrate(self, device: Driver) -> None:
+        """Probe the open `device`, and correct the force per volt in the amplitude's loop by the gain found."""
+        mode = self.parameters.mode
+        self.loop.settings["drive_from_force"][0, 0] = 1.0 / (probe_resonance(device, mode) * mode.force_constant)
 
     @property
     def fault(self) -> Fault | None:

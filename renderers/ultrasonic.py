@@ -7,12 +7,10 @@ driver of your own gets that carrier (V) at its own rate, and senses the mode's 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 from hapticrender.bands import Bands
 from hapticrender.checks import inside, require
 from hapticrender.control.device_model import Demand, DeviceModel
-from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters, UltrasonicSurface
@@ -70,9 +68,9 @@ class UltrasonicRenderer(FrictionRenderer):
         return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed), _demand(setup))
 
     def probe(self, setup: SurfaceSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes the response on the resonance of a surface that senses, unless driver or scene say no."""
-        allowed = setup.settings.probe and getattr(driver, "probe", True) and driver.sensed_channels
-        return partial(probe_resonance, mode=setup.assumed.mode) if allowed else None
+        """Return what probes the response on the resonance of a surface that senses, unless device or scene say no."""
+        probed = isinstance(driver, ResonantDriver) and driver.probe and driver.sensed_channels
+        return driver.calibrate if setup.settings.probe and probed else None
 
     def board_law(self, setup: SurfaceSetup) -> str:
         """Refuse boards."""

@@ -12,6 +12,7 @@ from test_identify_friction import Screen as StrangersScreen
 from test_ultrasonic_rendering import friction_of, watched
 
 import hapticrender as hr
+from hapticrender.control.probe_resonance import DURATION, REST
 from hapticrender.plants.electroadhesion import DRY, MOIST, NORMAL, ElectroadhesionParameters
 from hapticrender.plants.identify_friction import identify_resonance, identify_screen
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
@@ -222,6 +223,20 @@ def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, l
         errors.append(friction_errors(device, hr.render(scene, driver=device), speed, load)[0])
     assert errors[0] < MUST
     assert errors == sorted(errors)
+
+
+@pytest.mark.parametrize(("speed", "load", "block"), [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 16)])
+def test_white_noise_is_played_whole_on_a_resonator_that_is_probed_and_not_identified(speed, load, block):
+    """Resonance, Q and force per volt are not the design's; the last one, 10 % off, is what costs, and is probed."""
+    finger, errors = hr.Finger.sliding(speed=speed, normal_load=load, span=0.26), []
+    for probed in (True, False):
+        device = Resonator(load=lambda time: load, block=block)
+        device.probe = probed
+        scene = hr.Scene(texture=white(0.6), finger=finger, device="ultrasonic", duration=0.45, settle=0.2)
+        recording = hr.render(scene, driver=device)
+        del device.moved[: probed * round((DURATION + REST) * device.rate) // block]
+        errors.append(friction_errors(device, recording, speed, load)[0])
+    assert errors[0] < MUST < errors[1]
 
 
 @pytest.mark.parametrize(

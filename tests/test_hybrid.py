@@ -217,6 +217,8 @@ def test_the_plate_of_a_hybrid_is_probed_and_its_screen_without_drive(spoil, nam
     assert not drive[:, 2].any()
     assert abs(drive[-1]).max() == 0.0
     assert hr.prepare(replace(scene(tone(250.0)), rendering={"probe": False}), driver=device).probe is None
+    device.probe = False
+    assert hr.prepare(scene(tone(250.0)), driver=device).probe is None
 
 
 def test_without_sensors_both_parts_are_driven_open_loop():
