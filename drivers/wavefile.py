@@ -63,6 +63,7 @@ class WaveFileDriver(BaseDriver):
             raise DeviceNotFound(f"{self.path}: open: no folder {self.path.parent}")
         kind = FORMATS[self.path.suffix.lower()]
         try:
+            self.path.open("ab").close()  # which says why it fails, where libsndfile has a "System error"
             self._file = soundfile.SoundFile(
                 self.path, "w", round(self.rate), self.drive_channels, "FLOAT", format=kind
             )

@@ -92,8 +92,9 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 
 
 def as_json(report: Any) -> str:
-    """Format `report` as strict JSON, with null for every figure that is not finite."""
-    return json.dumps(_finite(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    """Format `report` as strict JSON, with null for every figure that is not finite; a lone surrogate is escaped."""
+    text = json.dumps(_finite(report), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text.encode("utf-8", "backslashreplace").decode()
 
 
 def _finite(value: Any) -> Any:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticrender.bands import NYQUIST_MARGIN, Bands
+from hapticrender.checks import require
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.inverse import share_driven
 from hapticrender.control.supervisor import drive_per_target
@@ -65,7 +66,9 @@ def perceptible(scene: Scene, bands: Bands, model: DeviceModel) -> Bands:
 
 
 def check_carriers(scene: Scene, model: DeviceModel, bands: Bands) -> None:
-    """Refuse carriers that the rate cannot carry, at the finger's top speed too."""
+    """Refuse carriers of 0 Hz, and those that the rate cannot carry, at the finger's top speed too."""
+    still = (bands.frequency == 0.0) & (bands.wavenumber == 0.0)
+    require(not still.any(), "texture.frequency", 0.0, "> 0 Hz in a band without a wavenumber: leave the band out")
     highest, frequency = NYQUIST_MARGIN * model.rate, bands.frequency.max(initial=0.0)
     if frequency > highest:
         bound = f"must be <= {highest:g} Hz, {NYQUIST_MARGIN} of the rate of {model.rate:g} Hz"

@@ -10,6 +10,7 @@ import pytest
 from waves import read_back
 
 from hapticrender.drivers.wavefile import FORMATS, WaveFileDriver
+from hapticrender.errors import DriverError
 from hapticrender.protocols import Driver
 
 FULL_SCALE = 2.5  # A
@@ -40,6 +41,12 @@ def test_a_file_holds_the_drive_within_half_a_step(tmp_path, rng, ending):
     assert error[1:].max() <= half + rounding
     assert error[1:].max() > 0.5 * half  # float32, not a finer form
     assert error[0, 0] <= 8 * half + rounding
+
+
+def test_a_file_that_cannot_be_opened_says_why(tmp_path):
+    (folder := tmp_path / "a.wav").mkdir()
+    with pytest.raises(DriverError, match="a.wav: open: .*Is a directory"), WaveFileDriver(folder):
+        pass
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL on this system")

@@ -275,6 +275,7 @@ SCENES = [
     (lambda: sweep([TONE], at_a_time=0), "at_a_time = 0: must be an integer >= 1 scenes"),
     (lambda: rendered(renderer=object()), r"renderer: must be an object with open\(scene, driver\).*not object"),
     (lambda: rendered(Own(TONE.waveform, bands=0)), "Own.bands returned int: must be hapticrender.Bands"),
+    (lambda: rendered(Own(TONE.waveform, bands=make_bands([0.0, 47.0], 1e-6))), "frequency = 0.0: must be > 0 Hz"),
     (lambda: opened("hybrid", crossover=30.0), r"render.crossover = 30.0: must be .* >= 40 and <= 400 Hz"),
     (lambda: opened("hybrid", replace(BY_CARRIERS["texture"], speed=None)), "a recording over time on carriers is not"),
     (lambda: opened("hybrid", FAR_UP), "texture.amplitude asks for an attraction of"),

@@ -238,11 +238,11 @@ def test_a_mismatch_is_a_warning_in_every_report_and_stops_no_scene(tmp_path):
 
 
 def test_reports_survive_figures_and_names_that_formats_forbid(verdicts, tmp_path):
-    summary = verdicts[1].summary | {"scene": "bell \x07 & <tag>", "wobble": float("nan"), "worst": {}}
+    summary = verdicts[1].summary | {"scene": "bell \x07 & <tag> \udce9", "wobble": float("nan"), "worst": {}}
     summary["worst"] = verdicts[1].summary["worst"] | {"value": float("inf")}
     verdict = Verdict.of(summary, elapsed=0.5)
-    assert junit(tmp_path, [verdict]).find("testcase").get("name") == "bell \\x07 & <tag>"
+    assert junit(tmp_path, [verdict]).find("testcase").get("name") == "bell \\x07 & <tag> \\udce9"
     write_json(tmp_path / "report.json", [verdict])
     [scene] = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"), parse_constant=pytest.fail)["scenes"]
-    assert scene["value"] is None
+    assert (scene["value"], scene["scene"]) == (None, summary["scene"])
     assert scene["summary"]["wobble"] is None

@@ -83,7 +83,7 @@ def assemble(
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
-    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in carriers])
+    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in np.atleast_1d(carriers)])
     drive, sensed = (np.array([values for _, values in found[key]]).reshape(-1, count).T for key in ("drive", "sensed"))
     made = Header.of(
         scene,
