@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -278,10 +279,17 @@ def opened(driver: Any, device: Driver, hangs: Callable[[], bool] = lambda: Fals
     """
     with opened_once(device), stopped_by_signal(), ExitStack() as waiting, ExitStack() as stack:
         entered = driver.__enter__()
-        stack.push(lambda *error: None if hangs() else driver.__exit__(*error))
+        stack.push(partial(_close, driver, hangs))
         stack.push(lambda kind, error, _: _rest(device, error, hangs))
         stack.callback(lambda: waiting.enter_context(stopped_by_signal(wait=True)))
         yield entered
+
+
+def _close(driver: Any, hangs: Callable[[], bool], *error: Any) -> None:
+    """Close the driver; a failure is noted on the error that there is already, which no driver can suppress."""
+    with noted_on(error[1]):
+        if not hangs():
+            driver.__exit__(*error)
 
 
 def _rest(device: Driver, error: BaseException | None, hangs: Callable[[], bool]) -> None:

@@ -1,6 +1,7 @@
 """The inner damper: its taps, its margins against exact poles, and a bending mode that it must not drive."""
 
 import math
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -52,6 +53,21 @@ def loop_of(plant, taps, delay):
         slope=np.zeros((1, c, c), complex),
         share=np.ones(1),
     )
+
+
+@pytest.mark.parametrize("count", [1, 500])
+def test_margins_of_many_bands_take_no_gigabytes(count):
+    """Bands that drive nothing leave those of the damper; an array of all frequencies and 500 bands has 300 MB."""
+    taps = damping_taps(oscillators(model_of(5000)), 2.0)[:1]
+    alone = loop_of(heave_plant(5000), taps, 1)
+    bands = {"frequency": np.linspace(20.0, 400.0, count), "share": np.ones(count), "observer": 4e-3}
+    loop = replace(alone, **bands, law=np.zeros((count, 1, 1), complex), slope=np.zeros((count, 1, 1), complex))
+    tracemalloc.start()
+    found = loop.margins()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert found.modulus == pytest.approx(alone.margins().modulus, rel=0.01)
+    assert peak < 50e6
 
 
 def heave_plant(rate, mode=None):

@@ -51,7 +51,7 @@ def failing(error):
     """A texture whose application fails after half a second."""
 
     def waveform(at, position):
-        if at.size < 100 and at[-1] > 0.5:  # not while it is designed for
+        if at.size <= 100 and at[-1] > 0.5:  # a piece of 20 ms; not while it is designed for
             raise error
         return 20e-6 * np.sin(2 * np.pi * 72.0 * at)
 

@@ -288,3 +288,32 @@ def test_a_function_of_time_is_read_ahead_of_the_driver_and_any_other_block_by_b
         reads.append(texture.read.count(1))
     equal(*runs)
     assert reads == [1000, 0]
+
+
+@pytest.mark.parametrize("closes", ["suppresses", "fails"])
+def test_what_a_driver_does_while_it_closes_hides_no_error(closes):
+    class Closing(Blocks):
+        def play(self, drive):
+            if len(self.played) == 50:
+                raise hr.DriverError("unplugged")
+            return super().play(drive)
+
+        def __exit__(self, *error):
+            super().__exit__(*error)
+            if closes == "fails":
+                raise OSError("closed already")
+            return True
+
+    with pytest.raises(hr.DriverError, match="^unplugged") as caught:
+        hr.render(TONE, driver=simulated(TONE, kind=Closing))
+    notes = "; ".join(getattr(caught.value, "__notes__", ()))
+    assert ("closed already" in notes) == (closes == "fails")
+
+
+def test_a_failure_to_close_is_raised_where_nothing_else_failed():
+    class Closing(Blocks):
+        def __exit__(self, *error):
+            raise OSError("closed already")
+
+    with pytest.raises(OSError, match="closed already"):
+        hr.render(TONE, driver=simulated(TONE, kind=Closing))

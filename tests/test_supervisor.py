@@ -397,6 +397,12 @@ def test_the_probe_names_a_delay_that_is_off_by_blocks(off, touched):
         probe_plate(plate, model)
 
 
+def test_the_probe_names_a_stated_delay_that_is_longer_than_it_lasts():
+    plate = Probed()
+    with pytest.raises(hr.DeviceFault, match="the loop's delay is 1 samples, not 100000"), plate:
+        probe_plate(plate, PlateParameters().device_model(5000.0, 100_000))
+
+
 def test_the_probe_passes_healthy_plates_under_any_finger(rng):
     """Off by 5 %, damping by 20 %, gains by 2 %, a sample late; a resting finger of up to 10 g."""
     for seed in range(6):

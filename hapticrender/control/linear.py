@@ -7,6 +7,7 @@ a frozen finger estimate, a drive inside its limits, no rounding.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -117,6 +118,16 @@ class ErrorLoop:
         contour = np.unique(np.concatenate([grid, close.ravel(), [0.0, rate / 2]]))
         contour = contour[(contour >= 0.0) & (contour <= rate / 2)]
         outside = math.exp(SLOWEST / rate)
-        if unstable_poles(lambda f: self.difference(outside * np.exp(2j * np.pi * f / rate)), contour):
+
+        def by_parts(response: Callable[[Array], Array], radius: float) -> Callable[[Array], Array]:
+            """`response` over frequency (Hz), some 1e5 numbers an array: in one, a thousand bands need gigabytes."""
+            return lambda f: np.concatenate(
+                [
+                    response(radius * np.exp(2j * np.pi * part / rate))
+                    for part in np.array_split(f, 1 + len(f) * len(carriers) // 100_000)
+                ]
+            )
+
+        if unstable_poles(by_parts(self.difference, outside), contour):
             return Margins.unstable()
-        return margins_of(lambda f: self.loop(np.exp(2j * np.pi * f / rate)), grid)
+        return margins_of(by_parts(self.loop, 1.0), grid)

@@ -163,7 +163,7 @@ def _compared(
                 h = _detrended(np.pad(response, ((delay, 0), (0, 0)))[: len(response)])
                 alike, power = float((y * h).sum()), float((h**2).sum())
                 residuals[name, delay, load] = 1.0 - alike / max((energy * power) ** 0.5, 1e-300)
-                scales[name, delay, load] = alike / power
+                scales[name, delay, load] = alike / max(power, 1e-300)
                 if (name, delay, load) == ("nothing", model.delay - model.block, 0):
                     stated = power
     return residuals, scales, stated
