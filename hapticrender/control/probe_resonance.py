@@ -23,7 +23,7 @@ SHARE = 0.05  # of the drive's limit
 REACH = 0.02  # of the resonance: half the range of the sweep
 DEAD = 0.1  # gain of a dead part, at most
 STRAIGHT = 0.8  # cosine of the gain's angle, 37 degrees, at least: a sample at 30 of 192 kHz is 56
-DOUBT = 2.0  # times the share of the response that the fit leaves
+OVER_RESIDUAL = 2.0  # least deviation of the gain, over the share of the response that the fit leaves
 LEAST = 0.4  # of the damping stated of the free surface: a quality 2.5 times that stated
 
 
@@ -57,7 +57,7 @@ def resonance_drive(mode: Any) -> Array:
 def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> tuple[str, float]:
     """Name what is not as stated in `sensed` (m, shape (n,)), `late` samples behind its drive ("": nothing); the gain.
 
-    The gain is 1 where it deviates by less than `DOUBT` times the share of the response that the fit leaves: in noise,
+    The gain is 1 where it deviates by less than `OVER_RESIDUAL` times the share of the response that the fit leaves: in noise,
     or while a finger comes, it is too small.
     """
     if not np.all(abs(sensed) < mode.sensor_range):
@@ -83,4 +83,4 @@ def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> tuple[
     if fault:
         return fault, 1.0
     left = np.linalg.norm((turned * into + rest) / (off - pole) - found) / np.linalg.norm(found)
-    return "", gain if abs(gain - 1.0) > DOUBT * left else 1.0
+    return "", gain if abs(gain - 1.0) > OVER_RESIDUAL * left else 1.0
