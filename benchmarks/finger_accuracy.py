@@ -45,17 +45,17 @@ def main(plate="rigid", count=40, seed=1):
     show(subjects, [study(subject, plate) for subject in subjects])
 
 
-def show(subjects, each):
+def show(subjects, errors):
     """Print the worst of their errors, and the standard errors of the impedance by band."""
-    print(f"{len(subjects)} subjects; one touch found in {sum(one.touches == 1 for one in each)}")
-    print(f"edges of contact: worst {1e3 * max(one.edge for one in each):.1f} ms (bound 10)")
-    print(f"load: worst {max(one.load.max() for one in each):.2f} of 5 % or 20 mN")
-    position = 1e3 * max(one.position.max(initial=0.0) for one in each)
+    print(f"{len(subjects)} subjects; one touch found in {sum(one.touches == 1 for one in errors)}")
+    print(f"edges of contact: worst {1e3 * max(one.edge for one in errors):.1f} ms (bound 10)")
+    print(f"load: worst {max(one.load.max() for one in errors):.2f} of 5 % or 20 mN")
+    position = 1e3 * max(one.position.max(initial=0.0) for one in errors)
     print(f"position above 0.15 N in the middle 30 mm: worst {position:.2f} mm (bound 1)")
-    velocity = [np.sqrt(np.nanmean(one.velocity**2)) for one in each]
+    velocity = [np.sqrt(np.nanmean(one.velocity**2)) for one in errors]
     print(f"velocity: rms, median of subjects {1e3 * np.median(velocity):.1f} mm/s")
     names = "impedance", "relative", "ratio"
-    error, relative, ratio = (np.concatenate([getattr(one, name) for one in each]) for name in names)
+    error, relative, ratio = (np.concatenate([getattr(one, name) for one in errors]) for name in names)
     parts = np.abs(np.stack([error.real, error.imag]))
     good = np.isfinite(parts)
     shares = [100 * (parts[good] < times).mean() for times in (1, 2)]
@@ -67,7 +67,7 @@ def show(subjects, each):
     by_load = {
         f"{low:g}-{high:g} N": group
         for low, high in LOADS
-        if (group := [one for one, subject in zip(each, subjects, strict=True) if low <= subject.load < high])
+        if (group := [one for one, subject in zip(errors, subjects, strict=True) if low <= subject.load < high])
     }
     rows = [["band (Hz)", "inside one", "two", *by_load]]
     for k, frequency in enumerate(FREQUENCIES):

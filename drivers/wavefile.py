@@ -97,5 +97,6 @@ def _is_own(path: Path) -> bool:
 
 
 def _reason(error: Exception) -> object:
-    """Message of libsndfile, without the path that it repeats."""
-    return getattr(error, "error_string", str(error)) or "not every sample was written"
+    """Message of libsndfile or of the system, without the path that it repeats."""
+    said = getattr(error, "error_string", None) or getattr(error, "strerror", None) or str(error)
+    return said or "not every sample was written"

@@ -28,7 +28,7 @@ from hapticrender.mathx import on_time
 from hapticrender.process_signals import ended_with_program, stopped_by_signal
 from hapticrender.protocols import Array, Controller, DeviceLoop, Driver, Flag, Renderer, Rendering, Sensed
 from hapticrender.recordings.recording import Recorder, Recording
-from hapticrender.touch.composed import refuse_to_overwrite
+from hapticrender.touch.composed import is_in_time, refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
@@ -316,7 +316,7 @@ class _Loop:
         self.step = driver.block * max(int(piece * driver.rate / driver.block), 1)
         self._start, self._ahead = 0, int(getattr(self.controller, "lookahead", 0))
         self._predict = PositionPredictor(driver.rate, self._ahead)
-        self._read_by_block = getattr(rendering.scene.texture, "spatial", True)  # else it is a function of time alone
+        self._in_time = is_in_time(rendering.scene.texture)
         self._touches = TouchWatch(rendering.model, self.controller, active=rendering.plant is None)
         self._contact = ContactLag(rendering.model.contact_length)
         self._held: dict[str, Array] = {"flags": np.zeros(0, int)}  # of samples whose motion has not been shown yet
@@ -339,7 +339,7 @@ class _Loop:
         finger, block = self.rendering.scene.finger, self.rendering.driver.block
         time = self._time(-(-count // block) * block)  # whole blocks: a motion may end with the scene
         position, load = finger.position(time), finger.load(time)
-        reference = None if self._read_by_block else self._reference(position)  # of the piece, as no driver changes it
+        reference = self._reference(position) if self._in_time else None  # of the piece, as no driver changes it
         for first in range(0, count, block):
             self._start, here = start + first, slice(first, first + block)
             self._exchange(position[here], load[here], None if reference is None else reference[here])

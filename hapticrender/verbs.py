@@ -20,6 +20,7 @@ from hapticrender.errors import naming
 from hapticrender.export import export as export_design
 from hapticrender.formatting import closed_pipes, printable, table
 from hapticrender.latency import measure_latency, write_delay
+from hapticrender.loop import opened as open_at_rest
 from hapticrender.loop import prepare
 from hapticrender.player import Player
 from hapticrender.protocols import Rendering
@@ -237,7 +238,8 @@ def identify(arguments: argparse.Namespace) -> int:
             "ultrasonic": lambda: UltrasonicPlate(setup.simulated.carrier_mode, Finger.absent(), seed),
             "electroadhesion": lambda: ElectroadhesionScreen(setup.simulated, scene.finger, seed),
         }
-        with registered("drivers", "simulated")(plants[scene.device]()) if driver is None else driver as opened:
+        device = registered("drivers", "simulated")(plants[scene.device]()) if driver is None else driver
+        with open_at_rest(device, device) as opened:
             if scene.device == "ultrasonic":
                 found = identify_resonance(opened, setup.assumed)
             elif scene.device == "electroadhesion":

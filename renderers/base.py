@@ -75,7 +75,7 @@ class BaseRenderer:
             controller=partial(design, bands),
             design=design,
             shape=self.shape(setup),
-            probe=self.probe(setup, model, facing),
+            probe=self.probe(setup, model, facing) if getattr(device, "probe", True) else None,
             board_law=partial(self.board_law, setup),
         )
 
@@ -131,7 +131,10 @@ class BaseRenderer:
         return model
 
     def probe(self, setup: Setup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes the open device behind `driver` before the loop closes; None where nothing does."""
+        """Return what probes the open device behind `driver` before the loop closes; None where nothing does.
+
+        It is not called for a device whose `probe` is False.
+        """
         return None
 
     def board_law(self, setup: Setup) -> str:

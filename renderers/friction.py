@@ -33,7 +33,8 @@ class FrictionSettings(Validated):
 
     `velocity_per_force` is the skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed
     carriers.  `square_root` says whether a screen's drive is an attraction (N), or the current's envelope itself.
-    `probe` says whether a vibrating surface, or the plate of a hybrid, is probed before the loop closes.
+    `probe` says whether a vibrating surface, or the plate of a hybrid, is probed before the loop closes; of a surface
+    the gain of drive and sensor is corrected.
     """
 
     velocity_per_force: float = parameter(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)

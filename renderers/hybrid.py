@@ -152,9 +152,8 @@ class HybridRenderer(BaseRenderer):
         return HybridDriver(driver, self.shape(setup), displacement, setup.velocity_per_force, late)
 
     def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes its plate, unless driver or scene say no."""
-        part = _part_of(driver, COILS, SENSORS, "plate")
-        return self._plate.probe(setup.plate, model, part) if getattr(driver, "probe", True) else None
+        """Return what probes its plate, unless the scene says no."""
+        return self._plate.probe(setup.plate, model, _part_of(driver, COILS, SENSORS, "plate"))
 
     def board_law(self, setup: HybridSetup) -> str:
         """Refuse boards."""

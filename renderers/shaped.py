@@ -47,7 +47,6 @@ class WrappedDriver:
         self.driver, self.hold = driver, hold
         self.rate, self.block, self.delay = driver.rate / hold, max(driver.block // hold, 1), driver.delay // hold
         self.drive_channels, self.sensed_channels = driver.drive_channels, driver.sensed_channels
-        self.probe = getattr(driver, "probe", True)
         self._level = 1.0  # factor on the device's drive
         rows, long = self.block, self.block * hold
         self.signals = {

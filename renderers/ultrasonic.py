@@ -68,8 +68,8 @@ class UltrasonicRenderer(FrictionRenderer):
         return ResonantDriver(driver, setup.assumed, setup.scene.finger, (setup.load, setup.speed), _demand(setup))
 
     def probe(self, setup: SurfaceSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes the response on the resonance of a surface that senses, unless device or scene say no."""
-        probed = isinstance(driver, ResonantDriver) and driver.probe and driver.sensed_channels
+        """Return what probes the response on the resonance of a surface that senses, unless the scene says no."""
+        probed = isinstance(driver, ResonantDriver) and driver.sensed_channels
         return driver.calibrate if setup.settings.probe and probed else None
 
     def board_law(self, setup: SurfaceSetup) -> str:

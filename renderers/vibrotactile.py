@@ -58,9 +58,9 @@ class VibrotactileRenderer(BaseRenderer):
         return Plate(setup.simulated, setup.scene.finger, seed)
 
     def probe(self, setup: PlateSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
-        """Return what probes the wiring of two coils and two sensors, unless driver or scene say no."""
+        """Return what probes the wiring of two coils and two sensors, unless the scene says no."""
         whole = setup.assumed.coils == driver.sensed_channels == 2
-        return partial(probe_plate, model=model) if setup.probe and getattr(driver, "probe", True) and whole else None
+        return partial(probe_plate, model=model) if setup.probe and whole else None
 
     def board_law(self, setup: PlateSetup) -> str:
         """Return the law of boards that plays it."""

@@ -80,7 +80,7 @@ def test_standard_errors_are_right(studied):
     assert all(0.60 < share < 0.76 for share in shares.values()), shares
 
 
-def test_the_published_figures_are_printed(studied, capsys):
+def test_the_benchmark_prints_the_errors_of_all_bands(studied, capsys):
     errors = [subject.errors(recording, found) for subject, recording, found in studied]
     show([subject for subject, _, _ in studied], errors)
     out = capsys.readouterr().out

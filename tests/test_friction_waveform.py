@@ -225,7 +225,9 @@ def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, l
     assert errors == sorted(errors)
 
 
-@pytest.mark.parametrize(("speed", "load", "block"), [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 16)])
+@pytest.mark.parametrize(
+    ("speed", "load", "block"), [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 16)]
+)
 def test_white_noise_is_played_whole_on_a_resonator_that_is_probed_and_not_identified(speed, load, block):
     """Resonance, Q and force per volt are not the design's; the last one, 10 % off, is what costs, and is probed."""
     finger, errors = hr.Finger.sliding(speed=speed, normal_load=load, span=0.26), []
@@ -236,7 +238,8 @@ def test_white_noise_is_played_whole_on_a_resonator_that_is_probed_and_not_ident
         recording = hr.render(scene, driver=device)
         del device.moved[: probed * round((DURATION + REST) * device.rate) // block]
         errors.append(friction_errors(device, recording, speed, load)[0])
-    assert errors[0] < MUST < errors[1]
+    assert errors[0] < min(MUST, errors[1])
+    assert errors[1] > MUST or block == 4  # the sooner the loop acts, the less its gain matters
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ import hapticrender as hr
 from hapticrender import loop
 from hapticrender.drivers.simulated import SimulatedDriver
 from hapticrender.plants.plate import Plate, PlateParameters
+from hapticrender.touch.composed import is_in_time
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
 SPATIAL = hr.Scene(
@@ -288,6 +289,15 @@ def test_a_function_of_time_is_read_ahead_of_the_driver_and_any_other_block_by_b
         reads.append(texture.read.count(1))
     equal(*runs)
     assert reads == [1000, 0]
+
+
+def test_a_part_that_states_nothing_is_read_where_the_driver_says_that_the_finger_is():
+    """In a sum or a playlist, too."""
+    here = hr.Chirp(start=50.0, stop=200.0, duration=1.0, amplitude=1e-6)
+    for texture in (Counted(here), here + Counted(here), hr.Playlist([(Counted(here), 1.0)])):
+        assert not is_in_time(texture)
+    for texture in (here, InTime(here), here + InTime(here), hr.Playlist([(here, 1.0)])):
+        assert is_in_time(texture)
 
 
 @pytest.mark.parametrize("closes", ["suppresses", "fails"])

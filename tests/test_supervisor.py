@@ -13,7 +13,7 @@ import hapticrender as hr
 from benchmarks import faults
 from benchmarks.false_stops import random_scene, run
 from hapticrender.control.gain_faults import WANDER, design_gains
-from hapticrender.control.probe import probe_plate
+from hapticrender.control.probe import judge, probe_drive, probe_plate
 from hapticrender.mathx import zoh
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
@@ -397,10 +397,14 @@ def test_the_probe_names_a_delay_that_is_off_by_blocks(off, touched):
         probe_plate(plate, model)
 
 
-def test_the_probe_names_a_stated_delay_that_is_longer_than_it_lasts():
-    plate = Probed()
+def test_the_probe_names_a_stated_delay_that_is_longer_than_it_lasts(rng):
+    """And dead sensors, whose noise has no energy that a response could be told from."""
+    plate, model = Probed(), PlateParameters().device_model(5000.0, 100_000)
     with pytest.raises(hr.DeviceFault, match="the loop's delay is 1 samples, not 100000"), plate:
-        probe_plate(plate, PlateParameters().device_model(5000.0, 100_000))
+        probe_plate(plate, model)
+    drive = probe_drive(model)
+    for _ in range(10):
+        assert "dead" in judge(model, drive, 1e-6 * rng.standard_normal((2 * len(drive), 2))).fault
 
 
 def test_the_probe_passes_healthy_plates_under_any_finger(rng):

@@ -156,7 +156,8 @@ def _compared(
     for load, finger in enumerate((None, *np.linalg.inv(model.coordinate_from_sensed))):
         parts = _responses(model, drive, finger)
         if finger is None:  # a delay may be off by blocks, which would look like another wiring
-            likely = _likely_delays(y, np.einsum("jjns->ns", parts))
+            stated = float((_detrended(free := np.einsum("jjns->ns", parts)) ** 2).sum())
+            likely = _likely_delays(y, free)
         for name, (sensors, actuators) in WIRINGS.items():
             response = np.einsum("jk,jkns->ns", actuators, parts) @ sensors.T
             for delay in {*delays, *(likely if name == "nothing" else ())}:
@@ -164,8 +165,6 @@ def _compared(
                 alike, power = float((y * h).sum()), float((h**2).sum())
                 residuals[name, delay, load] = 1.0 - alike / max((energy * power) ** 0.5, 1e-300)
                 scales[name, delay, load] = alike / max(power, 1e-300)
-                if (name, delay, load) == ("nothing", model.delay - model.block, 0):
-                    stated = power
     return residuals, scales, stated
 
 

@@ -64,7 +64,7 @@ def assemble(
     columns: Mapping[str, Any] | str | os.PathLike[str],
     chosen: Mapping[str, Chosen | None],
     rate: float | None,
-    carriers: Sequence[float],
+    carriers: float | Sequence[float],
     **header: Any,
 ) -> tuple[Header, Array]:
     """Header and frames from the columns `chosen` for drive, sensed, time, position and normal_load.
@@ -83,7 +83,8 @@ def assemble(
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
-    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in np.atleast_1d(carriers)])
+    several = [carriers] if isinstance(carriers, int | float) else carriers
+    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in several])
     drive, sensed = (np.array([values for _, values in found[key]]).reshape(-1, count).T for key in ("drive", "sensed"))
     made = Header.of(
         scene,

@@ -304,7 +304,7 @@ class Recording:
         time: Chosen | None = None,
         position: Chosen | None = None,
         normal_load: Chosen | None = None,
-        carriers: Sequence[float] = (),
+        carriers: float | Sequence[float] = (),
         **header: Any,
     ) -> Recording:
         """Make a recording of what another program has recorded, for analysis, pictures and `save`.
@@ -331,7 +331,7 @@ class Recording:
             NaN while the finger is away; default: not known.  A column of unsigned integers is unwrapped.
         normal_load : column, N
             Default: not known.
-        carriers : sequence of float, Hz
+        carriers : number or sequence of float, Hz
             Frequencies that were driven: the impedance is analysed at these.
         **header
             `name`, `device` (kind, or file of a profile), `unit` of the sensors ("m"), `drive_unit` ("A"),

@@ -55,6 +55,13 @@ def is_spatial(texture: Texture) -> bool:
     return bool(texture.bands(NOMINAL_RATE).follows_finger if stated is None else stated)
 
 
+def is_in_time(texture: Texture) -> bool:
+    """Whether a texture, or every part of it, states that it is not read at the finger's position."""
+    if isinstance(texture, _Composed):
+        return all(is_in_time(part) for part, _ in texture.parts)
+    return getattr(texture, "spatial", None) is False
+
+
 def refuse_to_overwrite(texture: Texture, path: Any) -> None:
     """Refuse to write to `path` where a texture, or a part of it, is read from that file."""
     for part, _ in texture.parts if isinstance(texture, _Composed) else ():
