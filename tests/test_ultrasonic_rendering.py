@@ -191,7 +191,7 @@ def test_a_vibrating_surface_is_probed_on_its_resonance(gain, changes, named, lo
 @pytest.mark.parametrize("noise", [2e-9, 20e-9])
 @pytest.mark.parametrize("changes", [(0.0, 1.0), (-60.0, 0.5), (60.0, 2.0)])
 def test_a_gain_is_refused_where_it_is_beyond_its_bounds_whatever_the_finger_does(load, noise, changes):
-    """On a surface that shares no code; `changes` of resonance (Hz) and quality.  Noise makes the fit 5 % too small."""
+    """On a surface that shares no code; `changes` of resonance (Hz) and quality.  Noise makes the fit 4 % too small."""
     off, quality = changes
     for gain, refusal in ((0.55, "0.5"), (0.65, ""), (1.5, ""), (1.75, "1.[678]")):
         device = Resonator(30e3 + off, 200.0 * quality, 1.777, load=lambda time: load, tell=scaled(gain), noise=noise)
@@ -202,7 +202,7 @@ def test_a_gain_is_refused_where_it_is_beyond_its_bounds_whatever_the_finger_doe
 
 @pytest.mark.parametrize("gain", [0.9, 1.0, 1.1])
 def test_a_gain_is_found_to_a_per_cent_and_not_taken_from_a_finger_that_comes(gain):
-    """A per cent costs 0.6 % of white noise behind 48 samples; a finger after 10 ms makes the fit 8 % too small."""
+    """A per cent costs 0.6 % of white noise behind 48 samples; a contact after 10 ms makes the fit 8 % too small."""
     for load in (0.0, 0.4, 15.0):
         found = probe_resonance(Resonator(30.1e3, 150.0, 1.777 * gain, lambda time: load), UltrasonicParameters())  # noqa: B023
         assert found == pytest.approx(gain, rel=0.01)

@@ -58,7 +58,7 @@ def judge_resonance(mode: Any, late: int, drive: Array, sensed: Array) -> tuple[
     """Name what is not as stated in `sensed` (m, shape (n,)), `late` samples behind its drive ("": nothing); the gain.
 
     The gain is 1 where it deviates by less than `OVER_RESIDUAL` times the share of the response that the fit leaves: in
-    noise, or while a finger comes, it is too small.
+    noise, or where a contact begins, it is too small.
     """
     if not np.all(abs(sensed) < mode.sensor_range):
         return f"samples of the sensor are no numbers, or beyond its range of {mode.sensor_range:g} m", 1.0
