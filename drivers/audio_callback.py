@@ -174,12 +174,11 @@ class BlockQueue:
         """Calls so far: sensed blocks with lower numbers are complete."""
         return int(counted(self.user_data + BLOCKS_AT, 0))
 
-    def put(self, number: int, drive: Array) -> bool:
-        """Leave the drive of call `number` (full scale 1, shape (block, channels)); False where that is over."""
+    def put(self, number: int, drive: Array) -> None:
+        """Leave the drive of call `number` (full scale 1, shape (block, channels))."""
         slot = number % SLOTS
         self._drive[slot] = drive
         counted(self._numbers.ctypes.data + 8 * slot, number - int(self._numbers[slot]))
-        return number >= self.blocks
 
     def take(self, number: int) -> tuple[Array, int]:
         """Return what call `number` sensed (full scale 1) and its flags."""

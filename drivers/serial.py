@@ -20,7 +20,7 @@ from hapticrender.drivers.base import BaseDriver
 from hapticrender.drivers.board_client import BoardClient as BoardClient
 from hapticrender.drivers.board_line import Line as Line
 from hapticrender.drivers.board_texture import BoardTexture as BoardTexture
-from hapticrender.drivers.protocol import Capabilities, Telemetry
+from hapticrender.drivers.protocol import Telemetry
 from hapticrender.errors import DeviceFault, DriverError, HapticError, WatchdogTimeout
 from hapticrender.protocols import Array, Controller, DeviceLoop, Flag, Rendering, Sensed
 
@@ -232,8 +232,15 @@ class BoardLoop:
         self._reconnections = self._client.reconnections
 
     def made(self, rendering: Rendering) -> tuple[Bands, BoardTexture | None]:
-        """Return what the board plays of a rendering; a ValueError where it cannot play it."""
-        return playable(rendering, self.driver.capabilities)
+        """Return what the board plays of a rendering: bands, or none and a texture, which `BoardTexture` may refuse.
+
+        A screen plays all as textures: its law makes friction of a waveform's derivative.
+        """
+        bands, board = rendering.bands, self.driver.capabilities
+        if bands.envelope is not None and len(bands) and not (bands.modulated or board.friction):
+            return bands, None
+        texture = BoardTexture(rendering.scene.texture, board, rendering.model, rendering.waveform_of)
+        return Bands.none(spatial=False), texture
 
     def replace(self, rendering: Rendering, bands: Bands, texture: BoardTexture | None) -> None:
         """Change to what was `made` of another rendering of the device: within 20 ms from bands to bands, else 40."""
@@ -292,14 +299,3 @@ class BoardLoop:
             size, error = moves * abs(band.target), abs(band.measured - band.target)
             rows.append((float(hertz), size, moves * abs(band.measured), error / size if size > 0.0 else math.nan))
         return rows
-
-
-def playable(rendering: Rendering, board: Capabilities) -> tuple[Bands, BoardTexture | None]:
-    """Return what a board plays of a rendering: its bands, or none and a texture, which `BoardTexture` may refuse.
-
-    A screen plays all as textures: its law makes friction of a waveform's derivative.
-    """
-    bands, texture = rendering.bands, rendering.scene.texture
-    if bands.envelope is not None and len(bands) and not (bands.modulated or board.friction):
-        return bands, None
-    return Bands.none(spatial=False), BoardTexture(texture, board, rendering.model, rendering.waveform_of)

@@ -31,7 +31,7 @@ from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Array, Controller, Flag, Rendering, Sensed
 from hapticrender.realtime_entry import RealtimeEntry
 from hapticrender.realtime_kernel import HORIZON
-from hapticrender.sampled_texture import FADE, EvaluatedTexture, ForeseenTexture, SampledTexture
+from hapticrender.sampled_texture import EvaluatedTexture, ForeseenTexture, SampledTexture
 from hapticrender.touch.composed import InseparableTexture
 from hapticrender.touch.finger import Finger
 
@@ -133,12 +133,9 @@ class LiveLoop(RealtimeEntry):
         self._has_motion, self.senses = False, False  # whether the device states its motion, and senses the finger
         self._itself = False  # whether it has stopped itself
         self._drive = np.zeros((self.driver.block, self.driver.drive_channels))
-        self._device: Any = rendering.driver if rendering.plant is None else rendering.plant
         self._began = math.nan  # s: computing a piece of a texture
         self._foreseen: tuple[int, tuple[int, ...]] = (0, ())  # sample and state of the last `foresee`
         self.slow = ""  # what to say of a texture that has run out as it takes longer than it lasts
-        self._shape_change: tuple[Any, Any, int] | None = None  # before the device: from, to, since (sample)
-        self._shape_done: tuple[Any, Any, int] | None = None  # the one that is done
         real = rendering.plant is None
         self._touches = TouchWatch(rendering.model, self.controller, active=real, slows=False)
         self._contact, self._followed = ContactLag(self.model.contact_length), 0  # of the samples before this one
@@ -171,7 +168,6 @@ class LiveLoop(RealtimeEntry):
             count = most or max(round(TURN * self.rate), 1)
             self._entry["sensed_position"], self._entry["lost"] = sensing, flags  # any number, for the step's address
             with uninterrupted():
-                count = 1 if self._shape_change is not self._shape_done else count
                 sensed = self._device_loop(count, lambda position: np.zeros(len(position)))[-1]
         at = (first + np.arange(len(sensed.sensed))) % len(self._true)
         if sensed.motion is not None:
@@ -179,7 +175,6 @@ class LiveLoop(RealtimeEntry):
         if sensed.normal_load is not None:
             self._true[at, -1] = sensed.normal_load
         self.senses = sensed.position is not None
-        self._change_shape()
         self._known = first + len(at)
         for texture in self._textures:
             if isinstance(texture, EvaluatedTexture) and texture.error is not None:
@@ -247,17 +242,6 @@ class LiveLoop(RealtimeEntry):
         slow = f"{PIECE:g} s of it took {took:.3g} s to compute, {took / PIECE:.3g} times as long as it lasts"
         return f"{name}: {slow}: it was not played to its end: compute it before play begins"
 
-    def _change_shape(self) -> None:
-        """Take the characteristic before the device over to that of the present texture, while it fades in."""
-        change = self._shape_change
-        if change is None or change is self._shape_done:
-            return
-        before, shape, since = change
-        share = min((self.samples - since + self.driver.block) / (FADE * self.driver.rate), 1.0)
-        self._device.shape = shape.after(before, share)
-        if share == 1.0:
-            self._shape_done = change
-
     def made(self, rendering: Rendering) -> tuple[SampledTexture | EvaluatedTexture, Controller]:
         """Return what plays another rendering of the same device; a ValueError where nothing can."""
         last, bands = self._control.controller, rendering.bands
@@ -280,10 +264,9 @@ class LiveLoop(RealtimeEntry):
             ready(controller)
         with nullcontext() if self._device_loop is None else self._turn:  # a piece is played with one shape
             self.play(texture, controller)
-            if rendering.shape is not None and hasattr(self._device, "reshape"):
-                self._device.reshape(rendering.shape)
-            elif rendering.shape is not None:
-                self._shape_change = self._device.shape, rendering.shape, self.samples
+            if rendering.shape is not None:
+                device: Any = self.rendering.plant or self.driver
+                device.reshape(rendering.shape)
         self.rendering = replace(rendering, **{name: getattr(self.rendering, name) for name in DEVICE})
         self.model = model
 

@@ -180,7 +180,7 @@ class Rendering:
     differentiated: bool = False  # the target is the time derivative of `waveform`
     controller: Callable[[], Controller]  # a new one at rest
     design: Callable[[Bands], Controller] | None = None  # one at rest for other bands; None: for these only
-    shape: Any = None  # static characteristic before the device, for this texture: `shape` of `plant`, else of `driver`
+    shape: Any = None  # static characteristic before the device, for this texture; `plant` or `driver` has `reshape`
     probe: Callable[[Driver], None] | None = None  # checks the open device, may correct its gain; None: nothing
     board_law: Callable[[], str] | None = None  # "plate" or "screen", which boards have; else a ValueError; None: none
 

@@ -13,9 +13,9 @@ from numba import carray
 from hapticrender.control.kernel import observed_envelope
 from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import CONVERSION_T, F8, I8, SIGNALS, call, kernel, pointer, record, step
-from hapticrender.plants.compiled import HUGE, SATURATED
+from hapticrender.plants.compiled import HUGE
 from hapticrender.plants.friction_laws import LAW, friction_ratio
-from hapticrender.plants.ultrasonic_kernels import amplitude_decay, sliding_reference, within_reach
+from hapticrender.plants.ultrasonic_kernels import amplitude_decay, approach, sliding_reference
 from hapticrender.protocols import Flag
 
 SIGMAS = 8.0  # of noise
@@ -128,16 +128,6 @@ def jumps(r, raw, start, count, lost):
 
 
 @kernel
-def approach(r, k, decay):
-    """Take the reference on a straight line to sample k of one of friction, no faster than the drive can; flags."""
-    line = r.reference + (r.goal - r.reference) * (k + 1) / r.hold
-    r.waveform = line if r.starting > 0 else within_reach(r.waveform, line, r.slew, decay)
-    if k == r.hold - 1:
-        r.reference, r.starting = r.goal, 0
-    return SATURATED if r.waveform != line else 0
-
-
-@kernel
 def advance(r, io, start, count, lost):
     """Take the amplitude on by a piece of a block, whose samples are tested before any drive is computed from them."""
     end = start + count
@@ -159,7 +149,7 @@ def advance(r, io, start, count, lost):
             flags[row] |= raised
             if r.sensors > 0:
                 sensed[row] = r.friction
-        flags[row] |= approach(r, k, decay)
+        flags[row] |= approach(r, k, r.hold, decay)
         r.sensed, r.flags = raw[n] if r.sensors > 0 else 0.0, 0
         call(r.controller, (r.controller_state, r.signals_at, 0, 1))
         played[n] = r.drive[0] if r.jumped < 0 else 0.0

@@ -26,6 +26,10 @@ import pytest  # noqa: E402
 ROOT = Path(__file__).resolve().parent.parent
 KEPT = 86_400.0  # s: caches of older sources are deleted after a day
 
+# The programs that a test starts find the package and the tests' modules wherever they run.
+PATHS = (str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH"))
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, PATHS))
+
 
 def fresh_cache(root: Path) -> Path:
     """Folder of compiled kernels named by numba's version and a hash of all sources that compile something.

@@ -80,9 +80,9 @@ int main(void)
             set_something();
         }
         const real_t waveform = draw_number(REAL(1e-4), faulty);
-        (void)law_step(&law, sensed, position, REAL(0.0), waveform, drive);
+        (void)law_step(&law, sensed, position, waveform, drive);
         bad += beyond(drive);
-        (void)supervisor_step(&supervisor, &supervised, sensed, position, REAL(0.0), waveform, drive);
+        (void)supervisor_step(&supervisor, &supervised, sensed, position, waveform, drive);
         bad += beyond(drive);
         stopped += (supervisor.cause != SUPERVISOR_FINE) ? 1u : 0u;
         if (stopped > STOPPED_FOR) {

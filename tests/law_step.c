@@ -101,8 +101,8 @@ static int64_t advance(law_t *law, supervisor_t *supervisor, int64_t signals, in
         for (int64_t i = 0; i < LAW_SENSORS; i++) {
             y[i] = (real_t)sensed[n * LAW_SENSORS + i];
         }
-        flags[n] |= (int64_t)((supervisor != NULL) ? supervisor_step(supervisor, law, y, x, REAL(0.0), reference, u)
-                                                   : law_step(law, y, x, REAL(0.0), reference, u));
+        flags[n] |= (int64_t)((supervisor != NULL) ? supervisor_step(supervisor, law, y, x, reference, u)
+                                                   : law_step(law, y, x, reference, u));
         for (int64_t i = 0; i < LAW_CHANNELS; i++) {
             drive[n * LAW_CHANNELS + i] = (double)u[i];
         }

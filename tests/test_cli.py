@@ -8,7 +8,6 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import hypothesis
 import numpy as np
@@ -393,8 +392,7 @@ def test_a_full_disk_gets_one_line_with_the_folder(tmp_path, tiny, verb, folder)
 
 def shell(line, folder, unbuffered="", **environment):
     """A command line as a shell runs the console script, without the current folder on Python's path."""
-    root = str(Path(__file__).resolve().parent.parent)
-    environment = {**os.environ, "PYTHONPATH": root, "PYTHONUNBUFFERED": unbuffered, **environment}
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered, **environment}
     command = ["bash", "-c", f"{sys.executable} -P -m hapticrender {line}"]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120)
 
@@ -481,4 +479,4 @@ def test_a_script_beside_a_clone_finds_the_package(tmp_path):
     """The clone's folder has the package's name, and is none."""
     (tmp_path / "hapticrender").mkdir()
     (tmp_path / "script.py").write_text("import hapticrender; hapticrender.Grating, hapticrender.Player")
-    subprocess.run([sys.executable, "script.py"], cwd=tmp_path, check=True)
+    subprocess.run([sys.executable, "-E", "script.py"], cwd=tmp_path, check=True)  # without the tests' PYTHONPATH

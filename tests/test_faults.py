@@ -4,13 +4,11 @@ Sensors and coils that change during a run are in test_supervisor.py; what the s
 the application, the process, the device that goes away, and what the probe had not been tried on.
 """
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +21,6 @@ import hapticrender as hr
 from hapticrender.process_signals import DEFAULT, _end, stopped_by_signal
 
 RATE = 5000.0
-TESTS = Path(__file__).resolve().parent
 
 
 class Logged(OtherPlate):
@@ -102,9 +99,8 @@ def test_a_signal_to_the_process_ends_in_zero_drive(tmp_path):
     command = [sys.executable, "-m", "hapticrender", "render", tmp_path / "long.toml", "--out", out]
     command += ["--driver", f"test_faults:logged:{log}"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    paths = {"PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS.parent)))}
     default = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # also where whoever runs the tests ignores it
-    with subprocess.Popen(command, **pipes, env=os.environ | paths, preexec_fn=default) as child:
+    with subprocess.Popen(command, **pipes, preexec_fn=default) as child:
         end = time.monotonic() + 120
         while not (log.exists() and log.stat().st_size > 16 * RATE):  # a second of both coils
             assert child.poll() is None, child.communicate()

@@ -14,7 +14,7 @@ from test_firmware_law import CAREFUL
 import hapticrender as hr
 from hapticrender.bands import Bands, hold_last
 from hapticrender.drivers.protocol import Cause
-from hapticrender.drivers.serial import SerialDriver, playable
+from hapticrender.drivers.serial import BoardTexture, SerialDriver
 from hapticrender.errors import DeviceFault
 from hapticrender.export import export
 from hapticrender.plants.sliding_contact import SlidingParameters
@@ -127,8 +127,8 @@ def test_a_board_plays_a_screen(program, tmp_path, library):
 def streamed(board, rendering):
     """Client whose screen plays ridges, and streams."""
     client = board.client().open()
-    bands, texture = playable(rendering, client.capabilities)
-    client.set_bands(bands, texture)
+    texture = BoardTexture(rendering.scene.texture, client.capabilities, rendering.model, rendering.waveform_of)
+    client.set_bands(Bands.none(spatial=False), texture)
     return client
 
 

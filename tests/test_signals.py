@@ -1,12 +1,10 @@
 """Ctrl-C, SIGTERM and SIGHUP, alone and several at once, in every thread: the drive is zero and the device closed."""
 
-import os
 import signal
 import subprocess
 import sys
 import threading
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +18,6 @@ from hapticrender.plants.plate import PlateParameters
 from hapticrender.process_signals import CLOSING, DEFAULT, GUARDED, WAITING, Terminated, _end, stopped_by_signal
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no such signals on this system")
-TESTS = Path(__file__).resolve().parent
 MADE = []
 
 
@@ -125,9 +122,7 @@ def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tm
 
 
 def run(command, **options):
-    paths = {"PYTHONPATH": os.pathsep.join(map(str, (TESTS, TESTS.parent)))}
-    options |= {"capture_output": True, "text": True, "check": False, "timeout": 120, "env": os.environ | paths}
-    return subprocess.run(command, **options)
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=120, **options)
 
 
 IN_A_THREAD = """
@@ -214,7 +209,6 @@ def test_a_live_run_of_the_command_line_is_stopped_cleanly(tmp_path, name, statu
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": os.getcwd()},
         preexec_fn=partial(signal.signal, number, signal.SIG_DFL),  # also where whoever runs the tests ignores it
     )
     line = run.stdout.readline()

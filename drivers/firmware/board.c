@@ -141,11 +141,9 @@ static void compute_drive(board_t *board)
         real_t reference = textures_step(&board->textures, board->position, board->sample + LAW_LOOKAHEAD,
                                          board->played.rate, &dry);
         board->flags |= dry != 0u ? BOARD_OVERRUN : 0u;
-        board->flags |= design.learns == 0u ? law_step(&board->law, board->sensed, board->position,
-                                                       board->finger.velocity, reference, board->drive)
-                                            : supervisor_step(&board->supervisor, &board->law, board->sensed,
-                                                              board->position, board->finger.velocity, reference,
-                                                              board->drive);
+        board->flags |= design.learns == 0u
+            ? law_step(&board->law, board->sensed, board->position, reference, board->drive)
+            : supervisor_step(&board->supervisor, &board->law, board->sensed, board->position, reference, board->drive);
         for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
             board->drive[c] = law_carrier(&design, board->drive[c]);
         }

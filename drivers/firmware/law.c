@@ -354,14 +354,12 @@ static void play(law_t *law, const real_t force[2], const real_t nominal[2], rea
     law->at_ring = (law->at_ring + 1u) % (uint32_t)(LAW_DELAY + 1);
 }
 
-uint32_t law_step(
-    law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference, real_t drive[])
+uint32_t law_step(law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[])
 {
     real_t coordinates[2];
     real_t force[2] = {REAL(0.0), REAL(0.0)};
     real_t nominal[2];
     real_t learned[2];
-    (void)velocity;
     law->flags = ((real_abs(position) > FARTHEST) || !(real_abs(reference) <= FARTHEST)) ? LAW_NONFINITE : 0u;
     const uint32_t invalid = sense(law, sensed, coordinates);
     finger_track(&law->finger, position, law->design->rate);

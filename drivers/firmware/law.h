@@ -172,10 +172,9 @@ uint32_t law_set_drive_limit(law_t *law, real_t limit);
 /*
  * Advance by a sample: from the sensors' samples (m) and the finger's position (m from the middle, NaN: no finger) to
  * the drive (A); returns flags.  `reference` is a waveform's value LAW_LOOKAHEAD samples ahead (m), played beside the
- * bands; 0 where there is none.  `velocity` is not used: the law tracks the position.
+ * bands; 0 where there is none.
  */
-uint32_t law_step(
-    law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference, real_t drive[]);
+uint32_t law_step(law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[]);
 
 /* Target and measured envelope (re, im; m) of a band < most_bands as of the last sample, at its carrier. */
 void law_target(const law_t *law, uint32_t band, real_t envelope[2]);

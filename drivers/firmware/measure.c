@@ -151,9 +151,9 @@ int main(void)
         const real_t shown[2] = {(real_t)sensed[0], (real_t)sensed[1]};
         const uint32_t start = measure_count();
 #ifdef SUPERVISED
-        flags |= supervisor_step(&supervisor, &law, shown, (real_t)position, REAL(0.0), waveform, drive);
+        flags |= supervisor_step(&supervisor, &law, shown, (real_t)position, waveform, drive);
 #else
-        flags |= law_step(&law, shown, (real_t)position, REAL(0.0), waveform, drive);
+        flags |= law_step(&law, shown, (real_t)position, waveform, drive);
 #endif
         const uint32_t taken = measure_count() - start - empty;
         most = (taken > most) ? taken : most;

@@ -366,14 +366,13 @@ static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed
 }
 
 uint32_t supervisor_step(
-    supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference,
-    real_t drive[])
+    supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[])
 {
     supervisor_t *s = supervisor;
     uint32_t flags = 0u;
     (void)memset(drive, 0, LAW_CHANNELS * sizeof(drive[0]));
     if (s->fade > REAL(0.0)) {
-        flags = law_step(law, sensed, position, velocity, reference, drive);
+        flags = law_step(law, sensed, position, reference, drive);
     }
     const uint32_t later = (s->at > 0u) ? (s->at - 1u) : (uint32_t)LAW_DELAY; /* when this sample's drive acts */
     for (uint32_t i = 0u; i < 2u; i++) {

@@ -80,7 +80,6 @@ void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const 
 
 /* Advance the law by a sample, see law_step, and supervise it; a stop is permanent. */
 uint32_t supervisor_step(
-    supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t velocity, real_t reference,
-    real_t drive[]);
+    supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[]);
 
 #endif

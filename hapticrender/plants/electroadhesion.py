@@ -9,13 +9,14 @@ time constants.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hapticrender.checks import Validated, option, parameter, require
 from hapticrender.control.demodulator import StarSTDFT
+from hapticrender.defaults import FADE
 from hapticrender.jit import record_of
 from hapticrender.plants.compiled import CompiledPlant
 from hapticrender.plants.electroadhesion_kernels import SCREEN, element, screen_step
@@ -50,15 +51,6 @@ class SquareRoot(Validated):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.bias > self.floor, "bias", self.bias, f"> floor = {self.floor:g} N")
-
-    def after(self, before: Any, share: float) -> SquareRoot:
-        """Return this one, its bias and floor gone up by a `share` (> 0 to 1) of the way from those of the one before.
-
-        Where they were higher they stay: a bias that is too large costs current only.
-        """
-        bias, floor = (before.bias, before.floor) if isinstance(before, SquareRoot) else (0.0, 0.0)
-        bias, floor = bias + share * max(self.bias - bias, 0.0), floor + share * max(self.floor - floor, 0.0)
-        return replace(self, bias=bias, floor=floor)
 
     def __call__(self, drive: Any) -> Any:
         """Current envelope (A, peak) for a `drive` (N of attraction around the bias)."""
@@ -208,7 +200,7 @@ class ElectroadhesionScreen(CompiledPlant):
             carrier=p.level == "carrier",
             voltage=p.drive_kind == "voltage",
             sensing=p.sensor == "impedance",
-            compensated=compensation is not None,
+            goal=compensation.bias if compensation else 0.0,
             substep=substep,
             turn=turn,
             area=p.area(1.0),
@@ -218,15 +210,8 @@ class ElectroadhesionScreen(CompiledPlant):
             gap=gap_record(p)[0],
             sliding=sliding_record(p)[0],
         )
-        self._shape = compensation
 
-    @property
-    def shape(self) -> SquareRoot | None:
-        """The compensation; another one acts from the next sample on."""
-        return self._shape
-
-    @shape.setter
-    def shape(self, shape: SquareRoot) -> None:
-        self._shape, self.state["compensated"] = shape, True
-        for name in ("bias", "floor", "gain", "straight"):
-            self.state[name] = getattr(shape, name)
+    def reshape(self, root: SquareRoot) -> None:
+        """Let the bias rise to that of another compensation within `FADE`; a smaller one is not taken."""
+        self.state["floor"], self.state["gain"], self.state["straight"] = root.floor, root.gain, root.straight
+        self.state["goal"], self.state["rise"] = root.bias, (root.bias - self.state["bias"]) / round(FADE * self.rate)

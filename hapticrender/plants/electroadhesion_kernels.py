@@ -23,7 +23,7 @@ OPEN_LOOP = int(Flag.OPEN_LOOP)
 FRICTION, ATTRACTION = range(2)  # columns of `motion`
 INPUTS = 4  # columns of the inputs
 
-FLAGS = ("carrier", "voltage", "sensing", "compensated", "straight")  # level, kind of drive, sensor, square root
+FLAGS = ("carrier", "voltage", "sensing", "straight")  # level, kind of drive, sensor, no square root
 NUMBERS = (  # named as in `ElectroadhesionParameters` and `SquareRoot`
     *("bias", "floor", "gain", "omega", "current_limit", "voltage_limit"),
     *("stray_capacitance", "body_resistance", "gap_resistance", "gap_short", "unevenness"),
@@ -35,6 +35,8 @@ SCREEN = np.dtype(
     + [
         ("series_impedance", "c16"),  # ohm m2
         ("area", "f8"),  # m2 at 1 N
+        ("goal", "f8"),  # N: bias of the compensation, to which the present one rises; 0: there is none
+        ("rise", "f8"),  # N a sample
         ("substep", "f8"),  # h, s
         ("turn", "c16"),  # e^{j w h}
         ("capacitance", "f8", (3,)),  # F/m2 of insulator, stratum corneum, gap
@@ -119,8 +121,9 @@ def attract(s, drive, x, noise):
     """Mean attraction (N) over a sample under `drive`, and flags; `x` is a row of inputs."""
     load, speed = x[LOAD], x[SPEED]
     peak = drive if abs(drive) < HUGE else 0.0
-    if s.compensated:
-        force = max(s.bias + peak, s.floor)
+    if s.goal > 0.0:
+        s.bias = max(s.bias, min(s.bias + s.rise, s.goal))
+        force = max(s.bias + peak, s.floor * (s.bias / s.goal))
         peak = force / math.sqrt(2.0 * s.bias * s.gain) if s.straight else math.sqrt(force / s.gain)
     limit = s.voltage_limit if s.voltage else s.current_limit
     flags = SATURATED if abs(peak) > limit else 0

@@ -108,14 +108,9 @@ class HybridPlant(CompiledPlant):
             screen_motion=rows[1],
         )
 
-    @property
-    def shape(self) -> Any:
-        """What is before the screen; see `ElectroadhesionScreen.shape`."""
-        return getattr(self.screen, "shape", None)
-
-    @shape.setter
-    def shape(self, shape: Any) -> None:
-        self.screen.shape = shape  # type: ignore[attr-defined]
+    def reshape(self, root: Any) -> None:
+        """Change what is before the screen; see `ElectroadhesionScreen.reshape`."""
+        self.screen.reshape(root)  # type: ignore[attr-defined]
 
     def inputs(self, first: int, n: int) -> Array:
         """Finger and whatever else the screen takes, sample by sample."""

@@ -67,11 +67,11 @@ SURFACE = np.dtype(
         ("drive", "f8", (1,)),  # V
         ("sensed", "f8"),  # m
         ("position", "f8"),  # NaN
-        ("waveform", "f8"),  # m: amplitude within reach
+        ("waveform", "f8"),  # m: amplitude within reach; the last one is what the drive could reach
         ("target", "c16"),  # m
         ("flags", "i8"),
-        ("reference", "f8"),  # state: amplitude (m) at the end of the last sample
-        ("reached", "f8"),  # state: amplitude (m) that the drive could reach by then; negative: starts from rest
+        *((name, "f8") for name in ("reference", "goal")),  # state: amplitude (m) before a sample of friction and after
+        ("starting", "i8"),  # state: it starts from rest, where the loop's own ramp is slower
         ("reading", "f8"),  # state: friction (N) by the sensed amplitude, output at the next sample
         ("law", LAW),
         ("mode", MODE),
@@ -131,14 +131,18 @@ def amplitude_decay(damping, finger, mass, period):
 
 
 @kernel
-def within_reach(reached, reference, slew, decay):
-    """Amplitude (m) on the way from `reached` to `reference` to which the drive can take it within a sample.
+def approach(s, k, count, decay):
+    """Take the waveform on a straight line to sample k of `count` to the goal, no faster than the drive can; flags.
 
-    With a faster reference the drive would saturate, and the loop would be open.
+    With a faster reference the drive would saturate, and the loop would be open.  `s` is a record with these fields.
     """
-    lost = decay * reached
-    rise = max(slew - lost, LEAST_SLEW * slew)
-    return reached + min(max(reference - reached, -slew - lost), rise)
+    line = s.reference + (s.goal - s.reference) * (k + 1) / count
+    lost = decay * s.waveform
+    rise = max(s.slew - lost, LEAST_SLEW * s.slew)
+    s.waveform = line if s.starting > 0 else s.waveform + min(max(line - s.waveform, -s.slew - lost), rise)
+    if k == count - 1:
+        s.reference, s.starting = s.goal, 0
+    return SATURATED if s.waveform != line else 0
 
 
 @kernel
@@ -156,28 +160,21 @@ def sliding_reference(s, drive, load, speed):
 
 
 @kernel
-def amplitude_pass(s, reference, x, noise):
-    """Carry the amplitude on a straight line to `reference` (m); return the mean true amplitude (m) and flags.
+def amplitude_pass(s, x, noise):
+    """Carry the amplitude on a straight line to the goal; return the mean true amplitude (m) and flags.
 
     The controller is called by address, with the signals of one sample, which are fields of the record.
     """
     m, flags, squares = s.mode, 0, 0.0
     scale, z, drive = 1.0 / (x[RESONANCE] * m.period), m.z, s.drive
-    before, from_rest = s.reference, s.reached < 0.0
-    reached = s.reached
     finger_damping = pointer(s.finger_damping, F8)[0] if s.finger_damping > 0 else 0.0
     decay = amplitude_decay(s.free_damping, finger_damping, m.mass, m.period)
     for k in range(s.substeps):
-        line = before + (reference - before) * (k + 1) / s.substeps
-        reached = line if from_rest else within_reach(reached, line, s.slew, decay)  # from rest the fade-in is slower
-        if reached != line:
-            flags |= SATURATED
+        flags |= approach(s, k, s.substeps, decay)
         s.sensed, _, s.flags = mode_step(m, drive, x[DAMPING], x[RESONANCE], noise[1 + k])
-        s.waveform = reached
         call(s.controller, (s.controller_state, s.signals_at, 0, 1))
         flags |= s.flags
         squares += z[0] * z[0] + scale * scale * z[1] * z[1]
-    s.reference, s.reached = reference, reached
     return math.sqrt(squares / s.substeps), flags
 
 
@@ -194,8 +191,8 @@ def surface_step(state, signals, start, count):
     for n in range(start, end):
         x = inputs[n]
         speed = x[SPEED]
-        whole, load, pace, reference, delayed = sliding_reference(s, drive[n], x[LOAD], speed)
-        amplitude, raised = amplitude_pass(s, reference, x, noise[n])
+        whole, load, pace, s.goal, delayed = sliding_reference(s, drive[n], x[LOAD], speed)
+        amplitude, raised = amplitude_pass(s, x, noise[n])
         steady = whole * friction_ratio(s.law, amplitude, load, pace)
         friction, reading = sliding_step(s.sliding, steady, speed, noise[n, 0])
         if s.estimating:

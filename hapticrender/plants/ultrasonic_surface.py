@@ -210,7 +210,7 @@ class UltrasonicSurface(CompiledPlant):
             controller_state=amplitude.state,
             finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
             position=np.nan,
-            reached=-1.0,
+            starting=1,
             law=p.friction_law.numbers,
             mode=inner[0],
             sliding=sliding_record(p)[0],

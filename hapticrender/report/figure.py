@@ -58,11 +58,11 @@ def check_format(path: str | os.PathLike[str]) -> Path:
     return path
 
 
-def save(figure: Any, path: str | os.PathLike[str], dpi: int = 110) -> None:
+def save(figure: Any, path: str | os.PathLike[str]) -> None:
     """Write a figure in the format of the ending of `path`; an older file is replaced when the new one is whole."""
     path = check_format(path)
     with np.errstate(all="ignore"), replacing(path) as scratch:
-        figure.savefig(scratch, dpi=dpi, format=path.suffix[1:].lower())
+        figure.savefig(scratch, dpi=110, format=path.suffix[1:].lower())
 
 
 def legend(axes: Any, *entries: Any, columns: int = 6) -> None:
