@@ -68,7 +68,8 @@ def test_every_format_gives_the_columns_in_si(theirs, tmp_path, ending):
 
 
 def test_it_is_a_recording_like_any_other(theirs, tmp_path):
-    made = hr.Recording.from_columns(theirs, rate=RATE, name="theirs", sensed_noise=1e-6, carriers=np.int64(111), **MEANING)
+    fields = {"rate": RATE, "name": "theirs", "sensed_noise": 1e-6, "carriers": np.int64(111)}
+    made = hr.Recording.from_columns(theirs, **fields, **MEANING)
     assert made.bands.frequency.tolist() == [111.0]  # one carrier needs no list
     made.save(tmp_path / "ours.npz")
     again = hr.Recording.load(tmp_path / "ours.npz")
