@@ -49,7 +49,8 @@ def require(good: bool, key: str, value: object, bound: str, error: type[Excepti
         refuse(key, value, bound, error)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(value: Any) -> bool:
+    value = value[()] if isinstance(value, np.ndarray) else value  # one without dimensions, as `numpy.where` returns
     return type(value) is float or (isinstance(value, Real) and not isinstance(value, bool | np.bool_))
 
 

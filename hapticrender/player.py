@@ -220,11 +220,11 @@ class Player(Addressed):
         """
         self._check()
         now, sane = time.monotonic() if self._paced else self.time, False
-        with suppress(TypeError, ValueError):
+        with suppress(TypeError, ValueError, OverflowError):
             if velocity is None:
                 moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
                 velocity = moved / passed if 0.0 < passed < UPDATES and abs(moved) <= FASTEST * passed else 0.0
-            sane = not abs(position) > REACH and abs(velocity) <= FASTEST and 0.0 <= load <= MOST_LOAD
+            sane = not math.fabs(position) > REACH and math.fabs(velocity) <= FASTEST and 0.0 <= load <= MOST_LOAD
         if velocity is None or not sane:
             bound = f"{REACH:g} m from the middle of the surface (NaN: lifted), {FASTEST:g} m/s, 0 to {MOST_LOAD:g} N"
             raise ValueError(f"{position=} m, {velocity=} m/s, {load=} N: must be at most {bound}")

@@ -68,7 +68,8 @@ def test_every_format_gives_the_columns_in_si(theirs, tmp_path, ending):
 
 
 def test_it_is_a_recording_like_any_other(theirs, tmp_path):
-    made = hr.Recording.from_columns(theirs, rate=RATE, name="theirs", sensed_noise=1e-6, carriers=111.0, **MEANING)
+    fields = {"rate": RATE, "name": "theirs", "sensed_noise": 1e-6, "carriers": np.int64(111)}
+    made = hr.Recording.from_columns(theirs, **fields, **MEANING)
     assert made.bands.frequency.tolist() == [111.0]  # one carrier needs no list
     made.save(tmp_path / "ours.npz")
     again = hr.Recording.load(tmp_path / "ours.npz")
@@ -143,6 +144,7 @@ def without(row, value):
         ({"x": np.ones(49)}, {}, "columns differ in length: i 50, x 49 samples"),
         ({"x": without(9, np.nan)}, {}, "sensed: column x: 1 values are not finite, first in row 9"),
         ({"i": np.full(50, "a")}, {}, "column i = .*: must be numbers, one a sample"),
+        ({"x": np.ma.masked_less(np.arange(50.0), 3.0)}, {}, "column x = .*: must be numbers, .* none of them masked"),
         ({}, {"rate": None}, "rate is missing: must be a sampling rate in Hz"),
         ({"t": GAP}, {"time": "t", "rate": RATE}, "row 20 is 1 samples off an even grid of 5000 Hz"),
         ({"t": LEAP}, {"time": "t", "rate": None}, "row 30 is 50 samples off an even grid of 5000 Hz"),

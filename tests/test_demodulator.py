@@ -67,6 +67,22 @@ def test_a_sample_that_is_no_number_counts_as_zero(rng):
     assert np.array_equal(found, expected)
 
 
+@pytest.mark.parametrize(
+    ("bandwidth", "rate", "channels", "message"),
+    [
+        (10.0, np.inf, 1, "rate = inf: must be a finite number > 0 Hz"),
+        (10.0, None, 1, "rate is missing: must be a finite number"),
+        ("10", RATE, 1, "bandwidth = '10': must be a finite number Hz"),
+        (10.0, RATE, 1.5, "channels = 1.5: must be an integer >= 1"),
+        (10.0, RATE, 0, "channels = 0: must be an integer >= 1"),
+    ],
+)
+def test_what_cannot_be_is_refused(bandwidth, rate, channels, message):
+    """An infinite rate gave envelopes of zero."""
+    with pytest.raises((ValueError, TypeError), match=message):
+        hr.Demodulator([50.0], bandwidth, rate, channels)
+
+
 def test_it_writes_where_it_is_asked_to(rng):
     samples, room = rng.standard_normal((40, 2)), np.empty((40, 2, 3), complex)
     demodulator = hr.Demodulator([50.0, 90.0, 140.0], BANDWIDTH, RATE, 2)

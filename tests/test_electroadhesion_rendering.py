@@ -100,6 +100,13 @@ def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
     assert amplitude(recording.motion, 100.0, 0.6, recording.rate)[0] == pytest.approx(10e-3 / 0.64, rel=0.01)
 
 
+def test_silence_is_played():
+    """Which needs no attraction: the loop's answer to noise is not cut off, which would be a failure."""
+    recording = hr.render(scene_on("electroadhesion", 0.0 * TONE, SLIDE, 1.5, keep_unfelt=True))
+    assert recording.summary()["reason"] == "the texture is zero, or far below what can be felt"
+    assert not recording.flags.any()
+
+
 @pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic"])
 def test_a_finger_without_load_counts_as_lifted(device):
     """Nothing is wanted of it, nothing is driven for it, and what follows is what was wanted."""

@@ -96,6 +96,14 @@ def test_sliding_keeps_its_speed_and_its_ends():
     np.testing.assert_allclose(speed[~turning], 0.08, rtol=1e-9)
 
 
+def test_an_array_without_dimensions_is_a_number():
+    """As `numpy.where` and `numpy.squeeze` return it; a masked one is none."""
+    assert Still(np.where(True, 0.01, 0.0)) == Still(0.01)
+    for bad in (np.array([0.01]), np.ma.masked, np.array(True)):
+        with pytest.raises(TypeError, match="at = .*: must be a finite number"):
+            Still(bad)
+
+
 def test_swiping_reaches_its_peak_speed():
     motion = SineMotion(frequency=3.0, speed=0.05)
     speed = np.abs(np.diff(motion.position(TIME))) / 1e-3

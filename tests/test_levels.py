@@ -154,3 +154,7 @@ def test_what_cannot_be_predicted_is_not_taken_and_says_why():
     assert reasons[ONE] == "the load of a moving finger tilts the plate"
     hybrid = replace(temporal(FREE, 120.0), device="hybrid")
     assert least_model(hybrid).text.endswith("the device has one level only")
+    chirp = hr.Chirp(start=30.0, stop=300.0, duration=1.0, amplitude=5e-6)  # the levels differ by 3.7 % of it
+    (envelope,) = least_model(replace(temporal(SLIDING, 120.0), texture=chirp, device="ultrasonic")).levels
+    assert not envelope.taken
+    assert "the texture has no carriers" in envelope.reason

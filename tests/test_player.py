@@ -268,6 +268,8 @@ def test_what_it_refuses(tmp_path):
             (lambda: player.finger(0.0, 50.0), r"velocity=50\.0 m/s"),
             (lambda: player.finger(0.0, 0.1, -1.0), r"load=-1\.0 N"),
             (lambda: player.finger(None), "position=None"),
+            (lambda: player.finger(0.01j, 0.0), "position=0.01j"),
+            (lambda: player.finger(0.0, 10**400), "velocity=1000"),
             (lambda: setattr(player, "gain", np.nan), "gain = nan: must be a finite number >= 0 and <= 10"),
             (lambda: player.sleep(-1.0), "seconds = -1.0"),
         ):

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from hapticrender.checks import integer, number
 from hapticrender.control.records import W, aligned
 from hapticrender.jit import entry, kernel, record
 from hapticrender.mathx import unit
@@ -122,7 +123,7 @@ class Demodulator:
 
     Raises
     ------
-    ValueError
+    ValueError, TypeError
         For a value out of its bounds.
 
     Notes
@@ -139,13 +140,12 @@ class Demodulator:
     """
 
     def __init__(self, frequency: Any, bandwidth: float, rate: float, channels: int = 1) -> None:
+        rate, bandwidth = number("rate", rate, "Hz", above=0.0), number("bandwidth", bandwidth, "Hz")
         b, a = StarSTDFT(bandwidth=bandwidth, rate=rate).coefficients
         frequency = np.atleast_1d(np.asarray(frequency, float))
         if frequency.ndim != 1 or not frequency.size or not ((frequency >= 0) & (frequency <= rate / 2)).all():
             raise ValueError(f"{frequency=} Hz must be at least one number from 0 to half the rate, {rate / 2:g} Hz")
-        if int(channels) != channels or channels < 1:
-            raise ValueError(f"{channels=} must be a whole number >= 1")
-        self.frequency, self.channels, self._sample = frequency, int(channels), 0
+        self.frequency, self.channels, self._sample = frequency, integer("channels", channels, least=1), 0
         self._coefficients = tuple(float(each) for each in (*b, *a[1:]))
         count = -(-frequency.size // W)
         step = np.zeros((count, W))

@@ -221,11 +221,14 @@ def _one_coordinate(scene: Scene) -> Scene | str | None:
 
 def _envelope(scene: Scene) -> Scene | str | None:
     """Leave out the carrier of a friction device."""
-    default = (ElectroadhesionParameters if scene.device == "electroadhesion" else SurfaceParameters).level
-    if _numbers(scene).get("level", default) == "envelope":
+    kind = ElectroadhesionParameters if scene.device == "electroadhesion" else SurfaceParameters
+    device = kind.with_overrides(_numbers(scene))
+    if device.level == "envelope":
         return None
-    if _numbers(scene).get("sensor") == "impedance":
+    if device.sensor == "impedance":
         return "the sensor measures the gap's impedance at the carrier"
+    if not len(scene.texture.bands(device.rate)):
+        return "the texture has no carriers at which it could be predicted"
     return _changed(scene, level="envelope")
 
 

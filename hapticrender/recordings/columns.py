@@ -83,8 +83,7 @@ def assemble(
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
-    several = [carriers] if isinstance(carriers, int | float) else carriers
-    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in several])
+    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in np.atleast_1d(carriers)])
     drive, sensed = (np.array([values for _, values in found[key]]).reshape(-1, count).T for key in ("drive", "sensed"))
     made = Header.of(
         scene,
@@ -120,8 +119,8 @@ def _columns(table: Mapping[str, Any], key: str, chosen: Chosen) -> list[tuple[s
             there = ", ".join(map(str, table)) or "none"
             raise ValueError(f"column {show(name)} is missing: there are {there}")
         values = np.squeeze(np.asarray(table[name]))
-        good = values.ndim == 1 and values.dtype.kind in "iufb"
-        require(good, f"column {name}", table[name], "numbers, one a sample")
+        good = values.ndim == 1 and values.dtype.kind in "iufb" and not np.ma.is_masked(table[name])
+        require(good, f"column {name}", table[name], "numbers, one a sample, none of them masked")
         if not several and key != "normal_load" and values.dtype.kind == "u":
             values = unwrap_counts(values)
         values = scale * (values.astype(float) - offset)
