@@ -184,7 +184,7 @@ class Stream(NamedTuple):
 
     first: int  # sample of the first row
     stride: int  # samples between rows
-    rows: tuple[tuple[float, ...], ...]  # as of `rows.Rows`
+    rows: tuple[tuple[float, ...], ...]  # as of `board_client.Rows`
 
 
 def cobs_encode(data: bytes) -> bytes:

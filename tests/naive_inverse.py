@@ -1,7 +1,8 @@
 """Slow, obvious twin of the waveform law, sample by sample, from docs/theory.md, "The waveform law", in its symbols.
 
-It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law; the drive is not
-rounded.  The reference comes `ahead` samples early, as a number a sample.
+It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law.  The reference comes
+`ahead` samples early, as a number a sample.  Left out: rounding, bands, a contact's lag and sticking, sensors that are
+late or show a derivative, lost samples, the supervisor's damper, and what follows a drive that is no number.
 """
 
 import numpy as np
@@ -161,7 +162,8 @@ class NaiveInverse:
         s, pole = 2j * np.pi * 180.0, law["pole"]
         low = s**2 + 2 * law["pole_damping"] * pole * s + pole**2
         z = th[0] + th[1] * s / w_n + th[2] * (s / w_n) ** 2 + th[3] * pole**2 / low + th[4] * pole * s / low
-        mass, damping = np.clip(z.real / (s**2).real, -2e-3, 10e-3), np.clip(z.imag / s.imag, 0.0, 12.0)
+        mass = np.clip(z.real / (s**2).real, -min(2e-3, 0.2 * self.M[0, 0]), 10e-3)
+        damping = np.clip(z.imag / s.imag, 0.0, 12.0)
         arm = np.outer([1.0, self.lever], [1.0, self.lever]) * self.contact
 
         def learned(matrix, order, both):

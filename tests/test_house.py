@@ -254,17 +254,18 @@ def test_commands_in_the_readme_are_in_the_makefile():
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-NAMED = re.compile(r"`([\w/]+\.py)`(?::((?: `[\w.]+`,?)+))?")
+NAMED = re.compile(r"`([\w/]+\.(?:py|c|h|txt))`(?::((?: `[\w.]+`,?)+))?")
 
 
-def test_functions_in_the_theory_exist():
-    named = NAMED.findall((ROOT / "docs" / "theory.md").read_text(encoding="utf-8"))
-    assert len(named) > 30
+@pytest.mark.parametrize(("page", "least", "before"), [("theory", 30, r"(?:def|class) "), ("contributing", 20, r"\b")])
+def test_names_on_a_page_exist(page, least, before):
+    named = NAMED.findall((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"))
+    assert len(named) > least
     missing = []
     for file, names in named:
         path = next((each for each in (ROOT / "hapticrender" / file, ROOT / file) if each.exists()), None)
         source = path.read_text(encoding="utf-8") if path else ""
-        found = [re.search(rf"(?:def|class) {name.split('.')[-1]}\b", source) for name in re.findall(r"[\w.]+", names)]
+        found = [re.search(rf"{before}{name.split('.')[-1]}\b", source) for name in re.findall(r"[\w.]+", names)]
         if path is None or not all(found):
             missing.append(f"{file}: {names}")
     assert not missing

@@ -41,11 +41,11 @@ LEARNING_DELAY, RELEARNING_DELAY, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a cont
 INITIAL_TIME = 60e-3  # s, from the second start of learning on: the deviation at that start is a parameter
 LOSS_TIME = 1e-3  # s without a position, by which a contact is lost
 MODEL_ERROR = 0.1  # of what the drive explains of a deviation: part that no parameter explains
-INNOVATIONS = 10.0  # weight of their mean square beside it: a tenth is noise; on friction devices dev's
+INNOVATIONS = 10.0  # weight of their mean square, times MODEL_ERROR^2: a tenth; on friction devices 0, and dev's is 1
 LEAST_NOISE = 5e-5  # of the sensors' range
 REPORT_DELAY = 10e-3  # s: a contact is reported within this
 HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
-GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation within 4 ms opens the inner damper
+GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation (rms over 4 ms) opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
 FRICTION = np.array([0.4, 0.4, 0.3, 0.1])  # of stiffness, damping and mass of a friction device; and samples of delay
@@ -127,7 +127,7 @@ def prior(model: DeviceModel) -> tuple[Array, Array]:
     sigma[HEAVE : HEAVE + 4] = 0.05 * k, c, 0.05 * m, 1.0
     sigma[LOAD] = LOAD_SIZE[0]
     if len(model.mass) > 1:
-        k, m, c = model.stiffness[1, 1], model.mass[1, 1] * OMEGA_N**2, c
+        k, m = model.stiffness[1, 1], model.mass[1, 1] * OMEGA_N**2  # c is heave's
         sigma[COUPLING : COUPLING + 3] = 0.03 * k, c, 0.05 * m
         sigma[LOAD + 1] = LOAD_SIZE[1]
     if model.finger.contact is None:  # friction: the device is what is not known, and no finger adds to it
@@ -176,8 +176,8 @@ class AdaptiveInverse:
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design the law for a device of 1 or 2 coordinates.
 
-        Where the device itself is estimated (friction, a resonance), and for a recording on chosen carriers, the law
-        works by bands; see `design_controller`.
+        By bands works a grating on a friction device, which has itself to be estimated, the amplitude of a resonance,
+        and a recording on chosen carriers; see `design_controller`.
         """
         if (
             bands.whole and model.mass[0, 0] == 0.0
@@ -277,8 +277,8 @@ def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, 
     noise = np.resize(noise, 2) * max(model.sensed_noise, LEAST_NOISE * model.sensed_limit)
     factor, friction = np.ones(PARAMETERS), model.finger.contact is None
     variance = 6.0 * noise**2 + (FRICTION_NOISE**2 if friction else 0.0)
-    for first, rate in (REVERSION_RATES | ({LOAD: FRICTION_REVERSION} if friction else {})).items():
-        factor[first:INITIAL] = 1.0 - 0.5 * rate**2 * REVERSION * period
+    for first, q in (REVERSION_RATES | ({LOAD: FRICTION_REVERSION} if friction else {})).items():
+        factor[first:INITIAL] = 1.0 - 0.5 * q**2 * REVERSION * period
     matrices = {}
     for name, value in before_contact(model).items():
         matrices[name] = np.eye(2)

@@ -10,8 +10,9 @@ poles, the device's errors dD of stiffness, damping, mass and delay, and the fin
 
     dev = dev_u - sum_i theta_i psi_i + noise,       psi_i = G [gamma_i beta_i],   dev_u = G [F_dev]
 
-holds whatever was played, and a Kalman filter finds theta; no stability limit follows from how fast it learns.  What it
-finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner damper on dev for a while after contact.
+holds whatever was played, and a Kalman filter finds theta; while G and the delay are right, no stability limit follows
+from how fast it learns.  What it finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner damper
+on dev for a while after contact.
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 
@@ -272,7 +273,7 @@ def inverse_step(state, signals, start, count):
     position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
         implausible = sense_block(c, io, n, 1)
-        if c.locked == 0:
+        if c.locked == 0:  # else `sense_block` has
             track_finger(c, position[n])
         y0, y1 = samples[Y, 0], samples[Y + 1, 0]
         if c.bands > 0:

@@ -67,7 +67,7 @@ def discretise(controller, inverse):
     k11 = corrected(v.stiffness[1, 1], theta[HEAVE])
     scale = 1.0 / (m00 * m11 - m01 * m01)
     i00, i01, i11 = scale * m11, -scale * m01, scale * m00
-    # rates (1/s) that bound the norm; the step is halved until the series converges, and doubled again after it
+    # T |M^-1| (|C| + T |K|), without unit; the step is halved until the series converges, and doubled again after it
     size = (abs(i00) + abs(i01) + abs(i11)) * (c00 + abs(c01) + c11 + period * (k00 + abs(k01) + k11)) * period
     halvings = 0
     while size > 0.5 and halvings < 30:

@@ -42,7 +42,7 @@ INVERSE = np.dtype(
         ("pole_step", np.float64, (2, 4)),  # step of the pair of poles: two states, r now and next
         ("force_from_drive", np.float64, (2, MOST_CHANNELS)),
         *((name, np.float64, (2, 2)) for name in ("mass", "damping", "stiffness")),
-        ("noise", np.float64, (2,)),  # variances of heave and rocking: 6 (sensor noise)^2, first part of sigma_e^2
+        ("noise", np.float64, (2,)),  # of heave and rocking: what is constant in sigma_e^2
         *((name, np.float64) for name in ("deviations", "innovations")),  # weights of mean squares in `model_power`
         ("model_error", np.float64),  # part of `model_power` in sigma_e^2
         ("noise_share", np.float64),  # (sensor noise)^2 over `noise` on friction devices, of P: noise's; else 0
