@@ -1,4 +1,4 @@
-"""Measure what presses, and touches that take as long as a finger's, leave of a texture.
+"""Measure the error of a texture around presses, and around touches that take as long as a finger's.
 
 Run: python -m benchmarks.contacts [seeds]
 

@@ -50,8 +50,10 @@ def require(good: bool, key: str, value: object, bound: str, error: type[Excepti
 
 
 def _is_number(value: Any) -> bool:
+    if type(value) is float:  # a long list is of these
+        return True
     value = value[()] if isinstance(value, np.ndarray) else value  # one without dimensions, as `numpy.where` returns
-    return type(value) is float or (isinstance(value, Real) and not isinstance(value, bool | np.bool_))
+    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
 
 
 def _bound(kind: str, unit: str, above: End, least: End, most: End) -> str:

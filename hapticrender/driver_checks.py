@@ -14,7 +14,7 @@ from hapticrender.protocols import Array, Flag, Sensed
 
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
-FARTHEST = 1.0  # m from the middle: no surface is as large, and positions in mm are refused
+FARTHEST = 2.0  # m from the middle: as far as motions reach; most positions in mm are beyond
 MOST_RATE = 1e7  # Hz: of the fastest device that parameters can state; filters and logs take memory by it
 FLAGS = sum(Flag)  # all bits
 OPEN: set[int] = set()  # identities of the devices that play
@@ -103,8 +103,10 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
     if given.shape != shape:
         raise ProtocolError(f"{where} has shape {given.shape}, must be {shape}")
     if name == "position" and (beyond := abs(column) > FARTHEST).any():
-        found = f"{column[beyond][0]:g} m from the middle"
-        raise ProtocolError(f"{where} is {found}: must be m, <= {FARTHEST:g}, NaN while lifted")
+        found = (
+            f"{column[beyond][0]:g} m: must be within {FARTHEST:g} m of the middle, in m and not mm, NaN while lifted"
+        )
+        raise ProtocolError(f"{where} is {found}")
     if kind is np.int64 and (unknown := int(np.bitwise_or.reduce(column)) & ~FLAGS):
         raise ProtocolError(f"{where} has bits {unknown}, must be of hapticrender.Flag, 0 to {FLAGS}")
     return column

@@ -215,8 +215,7 @@ class Player(Addressed):
     def finger(self, position: float, velocity: float | None = None, load: float = 0.4) -> None:
         """Set where the finger is: position (m from the middle, NaN: lifted), velocity (m/s), normal load (N).
 
-        At most 0.15 m, 10 m/s and 20 N.  It goes on at this velocity for 50 ms at most.  Without a velocity, that since
-        the last call is taken.  After 0.25 s without a call a function of position fades out.
+        At most 0.15 m, 10 m/s, 20 N.  Velocity (or that since the last call) holds for 50 ms, a spatial texture 0.25 s.
         """
         self._check()
         now, sane = time.monotonic() if self._paced else self.time, False
@@ -224,7 +223,8 @@ class Player(Addressed):
             if velocity is None:
                 moved, passed = position - (self._finger or (math.nan,))[0], now - self._finger_time
                 velocity = moved / passed if 0.0 < passed < UPDATES and abs(moved) <= FASTEST * passed else 0.0
-            sane = not math.fabs(position) > REACH and math.fabs(velocity) <= FASTEST and 0.0 <= load <= MOST_LOAD
+            position, velocity, load = (float(1.0 * each) for each in (position, velocity, load))
+            sane = not abs(position) > REACH and abs(velocity) <= FASTEST and 0.0 <= load <= MOST_LOAD
         if velocity is None or not sane:
             bound = f"{REACH:g} m from the middle of the surface (NaN: lifted), {FASTEST:g} m/s, 0 to {MOST_LOAD:g} N"
             raise ValueError(f"{position=} m, {velocity=} m/s, {load=} N: must be at most {bound}")

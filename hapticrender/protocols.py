@@ -45,7 +45,7 @@ class Sensed(NamedTuple):
     """A driver's measurements over a block of n samples; None where something is not measured."""
 
     sensed: Array  # (n, sensed_channels), in the sensors' unit (m on a plate)
-    position: Array | None = None  # (n,), m from the middle of the surface, NaN while no finger touches
+    position: Array | None = None  # (n,), m (2 at most) from the middle of the surface, NaN while no finger touches
     motion: Array | None = None  # (n, places): true motion at the evaluation points (model.places), where it is known
     normal_load: Array | None = None  # (n,), N
     flags: Array | None = None  # (n,), `Flag` bits raised by the device

@@ -1,8 +1,9 @@
 """Slow, obvious twin of the waveform law, sample by sample, from docs/theory.md, "The waveform law", in its symbols.
 
 It imports nothing under test: `p` has the controller's numbers, `law` those of the waveform law.  The reference comes
-`ahead` samples early, as a number a sample.  Left out: rounding, bands, a contact's lag and sticking, sensors that are
-late or show a derivative, lost samples, the supervisor's damper, and what follows a drive that is no number.
+`ahead` samples early, as a number a sample.  Left out: rounding, bands, what friction devices add (a contact's lag and
+sticking), sensors that are late or show a derivative, lost samples, the supervisor's damper, and what follows a drive
+that is no number.
 """
 
 import numpy as np

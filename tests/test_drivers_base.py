@@ -133,8 +133,8 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
         ({"flags": np.full(4, -1)}, "flags has bits -256, must be of hapticrender.Flag"),
         ({"sensed": np.ones((1, 4))}, r"sensed has shape \(1, 4\), must be \(4, 1\)"),
         ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
-        ({"position": np.array([0.0, np.nan, np.inf, 0.0])}, "position is inf m from the middle: must be m, <= 1"),
-        ({"position": np.array([0.0, np.nan, 0.0, -20.0])}, "position is -20 m from the middle: must be m, <= 1"),
+        ({"position": np.array([0.0, np.nan, np.inf, 0.0])}, "position is inf m: must be within 2 m of the middle"),
+        ({"position": np.array([0.0, np.nan, 0.0, -20.0])}, "position is -20 m: must be within 2 m .* in m and not mm"),
     ],
 )
 def test_a_column_that_would_lose_something_is_refused(columns, message):

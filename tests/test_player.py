@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from decimal import Decimal
 
 import numpy as np
 import pytest
@@ -269,6 +270,7 @@ def test_what_it_refuses(tmp_path):
             (lambda: player.finger(0.0, 0.1, -1.0), r"load=-1\.0 N"),
             (lambda: player.finger(None), "position=None"),
             (lambda: player.finger(0.01j, 0.0), "position=0.01j"),
+            (lambda: player.finger(0.0, Decimal("0.01")), "velocity=Decimal"),
             (lambda: player.finger(0.0, 10**400), "velocity=1000"),
             (lambda: setattr(player, "gain", np.nan), "gain = nan: must be a finite number >= 0 and <= 10"),
             (lambda: player.sleep(-1.0), "seconds = -1.0"),

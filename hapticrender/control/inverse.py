@@ -176,8 +176,8 @@ class AdaptiveInverse:
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design the law for a device of 1 or 2 coordinates.
 
-        By bands works a grating on a friction device, which has itself to be estimated, the amplitude of a resonance,
-        and a recording on chosen carriers; see `design_controller`.
+        A grating on a friction device, which has itself to be estimated, the amplitude of a resonance, a recording on
+        chosen carriers, and bands beyond the filters are controlled by bands; see `design_controller`.
         """
         if (
             bands.whole and model.mass[0, 0] == 0.0

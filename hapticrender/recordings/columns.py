@@ -3,7 +3,7 @@
 import csv
 import os
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +83,8 @@ def assemble(
     rate = _rate(rate, found["time"][0][1] if "time" in found else None, count)
     own = {"name": Path(source).stem} | {key: header.pop(key) for key in ("name", "device") if key in header}
     scene = Scene(texture=Custom(f"what {source} was recorded with"), duration=count / rate, settle=0.0, **own)
-    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in np.atleast_1d(carriers)])
+    several = carriers if isinstance(carriers, Iterable) and getattr(carriers, "shape", None) != () else [carriers]
+    band = np.array([number("carriers", each, "Hz", above=0, most=rate / 2) for each in several])
     drive, sensed = (np.array([values for _, values in found[key]]).reshape(-1, count).T for key in ("drive", "sensed"))
     made = Header.of(
         scene,
