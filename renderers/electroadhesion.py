@@ -61,7 +61,7 @@ class ScreenSetup(FrictionSetup):
         gain = self.open_loop_gain / assumed.gain(load) * float(assumed.attraction(1.0, load))
         most = gain * limit**2
         swing = settings.headroom * self.needed(self.model(Port(assumed.rate, 1, 1))).drive
-        bias = max(swing, 1e-3) / (1.0 - settings.floor)  # N: in silence, too, above the noise (0.3 mN)
+        bias = max(swing, 1e-3) / (1.0 - settings.floor)  # N: silence, too, is above the default noise, 0.3 mN of drive
         if bias + swing > most:
             bound = f"must be <= {most:.3g} N, at {limit:.3g} {unit} under a nominal finger of {load:.3g} N"
             raise ValueError(f"texture.amplitude asks for an attraction of {bias + swing:.3g} N: {bound}")

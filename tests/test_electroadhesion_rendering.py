@@ -100,9 +100,10 @@ def test_a_finger_that_rests_or_is_away_winds_nothing_up(device, lifted):
     assert amplitude(recording.motion, 100.0, 0.6, recording.rate)[0] == pytest.approx(10e-3 / 0.64, rel=0.01)
 
 
-def test_silence_is_played():
+@pytest.mark.parametrize("device", ["electroadhesion", "hybrid"])
+def test_silence_is_played(device):
     """Which needs no attraction: the loop's answer to noise is not cut off, which would be a failure."""
-    recording = hr.render(scene_on("electroadhesion", 0.0 * TONE, SLIDE, 1.5, keep_unfelt=True))
+    recording = hr.render(scene_on(device, 0.0 * TONE, SLIDE, 1.5, keep_unfelt=True))
     assert recording.summary()["reason"] == "the texture is zero, or far below what can be felt"
     assert not recording.flags.any()
 
