@@ -25,14 +25,14 @@ BANDS = 8  # of a board at least: set-points may need more than the scene does
 CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
-BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES, PAST_BYTES = 12_636, 384  # of the rest, with the textures' own; more where the damper has over 16 taps
+BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "PAST": 16, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
+OTHER_BYTES = 12_528  # of the rest, with the textures' own
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
 _CONTROLLER = """
 drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force pattern
-damper_high release
+damper_high damper_limit release
 """.split()
 _LAW = """
 mass damping stiffness lever_per_metre gate_threshold high_pass_smoothing mean_square_smoothing filters
@@ -42,10 +42,10 @@ levelling_smoothing prior initial_variance prior_covariance
 _SUPERVISION = """
 invalid_smoothing frozen_drive low high corner top_gain omega energy_smoothing power_smoothing
 drive_smoothing ring_corner ring_top_gain ring_smoothing lever danger_motion danger_drive most_motion most_drive
-large_drive sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing fade_out fade_now
+large_drive most_damping sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing fade_out fade_now
 mass damping stiffness bound noise ringing
 """.split()
-_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()
+_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow limit".split()
 _GAINS = """
 scale innovation mean_smoothing window_smoothing step_state step_force filter_gain
 sensor_from_coordinate force_of_actuator
@@ -90,8 +90,7 @@ def _law(rendering: Rendering) -> str:
 
 def _memory(sizes: dict[str, int]) -> str:
     """State the static memory of a board of these sizes."""
-    taken = OTHER_BYTES + (PAST_BYTES if sizes["DAMPER_TAPS"] > 16 else 0)
-    taken = -(-(taken + sum(each * sizes[name] for name, each in BYTES.items())) // 8) * 8
+    taken = -(-(OTHER_BYTES + sum(each * sizes[name] for name, each in BYTES.items())) // 8) * 8
     note = f"/* Bytes of board_t, with real_t and pointers of 4: {taken + 65_536} with the textures of texture.h. */"
     return f"{note}\n#define BOARD_BYTES ({taken}u + 8u * TEXTURE_RING + 4u * TEXTURE_POINTS)\n"
 
@@ -121,6 +120,8 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
         "SENSORS": max(sensors, 1),  # an array of none is no C
         "CHANNELS": channels,
         "DAMPER_TAPS": taps,
+        "TAP_STRIDE": int(settings["tap_stride"]),
+        "PAST": 1 << (max(taps * int(settings["tap_stride"]), 4) - 1).bit_length(),  # deviations, a power of two
         "FRICTION": int(screen),
     }
     lowest, period = lowest_carrier(model, used), 1.0 / model.rate

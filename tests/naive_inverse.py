@@ -25,7 +25,11 @@ class NaiveInverse:
         self.theta, self.P = law["prior"].copy(), law["prior_covariance"].copy()
         self.psi = np.zeros((4, COUNT + 1))  # states of the regressors, and of dev_u
         self.references, self.forces = [], []  # r, early; basis and deviation force of each sample
-        self.poles, self.basis, self.past = np.zeros(2), np.zeros(6), np.zeros((2, self.taps.shape[1]))
+        self.poles, self.basis, self.past = (
+            np.zeros(2),
+            np.zeros(6),
+            np.zeros((2, p["tap_stride"] * self.taps.shape[1])),
+        )
         self.fade = self.slow = self.power = self.timer = self.open = self.moment = self.lever = self.peak = 0.0
         self.contact, self.since, self.hold_left, self.scale, self.smooth = 0, 1e9, 0, 1.0, 1.0
         self.samples = self.away = 0
@@ -57,7 +61,8 @@ class NaiveInverse:
         beta, d1, d2 = self.find_basis(n)
         nominal = self.K @ self.alpha * beta[0] + self.C @ self.alpha * d1 + self.M @ self.alpha * d2
         force = nominal + self.directions() @ self.played() + self.levelling_force()
-        force = force - (self.open * p["damper_high"]) * (self.taps * self.past).sum(axis=1)
+        damper = -(self.taps * self.past[:, :: p["tap_stride"]]).sum(axis=1)
+        force = force + self.open * p["damper_high"] * np.clip(damper, -p["damper_limit"], p["damper_limit"])
         drive = self.play(force)
         self.forces.append((beta, self.to_force @ drive - nominal))
         self.advance(n)

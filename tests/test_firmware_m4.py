@@ -106,7 +106,7 @@ def eight(tmp_path_factory):
     partials, folder = tuple((1.0 + 0.25 * k, 1.0, 0.0) for k in range(8)), tmp_path_factory.mktemp("eight")
     texture = hr.Grating(amplitude=40e-6 / 9, wavelength=1e-3, partials=partials)
     rendering = hr.prepare(hr.Scene(texture=texture, finger=FINGERS["slide"], duration=1.0, keep_unfelt=True))
-    program = built(folder, rendering, "measure-m4.elf", "OPTIMISE=-O2 -funroll-loops -DSUPERVISED")
+    program = built(folder, rendering, "measure-m4.elf", "OPTIMISE=-O3 -funroll-loops -DSUPERVISED")
     return folder, rendering, measured(program)
 
 

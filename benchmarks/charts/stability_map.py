@@ -10,9 +10,10 @@ import numpy as np
 
 from benchmarks.charts.polar_loop import PolarLoop
 from benchmarks.charts.poles import loop_poles
-from hapticrender.control.damping import choose_damping, damping_taps, oscillators
+from hapticrender.control.damping import damping_taps, oscillators
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.linear import DiscretePlant, ErrorLoop
+from hapticrender.control.load_damper import choose_load_damping
 from hapticrender.control.margin_check import error_loop
 from hapticrender.control.margins import sensitivity
 from hapticrender.plants.plate import PlateParameters, structure
@@ -122,7 +123,7 @@ def damper_map(case: Case) -> StabilityMap:
     The loop is that of the error observer with a band that has faded out, and a DC estimate, which the damper does not
     use: their poles, at -50 1/s and beyond, are the only ones that are not the damper's.
     """
-    plant, taps, nothing = case.plant(), choose_damping(MODEL).taps, np.zeros((1, 2, 2))
+    plant, taps, nothing = case.plant(), choose_load_damping(MODEL).taps, np.zeros((1, 2, 2))
     grid = np.concatenate([np.linspace(1.0, 0.499 * plant.rate, 300), plant.modes()])
     growth, modulus = np.zeros((2, len(DELAYS), len(FACTORS)))
     for at in np.ndindex(growth.shape):

@@ -20,7 +20,7 @@
 #define LIKELY REAL(9.0) /* variances: 3 sigma of a gain */
 #define HEALTHY REAL(0.35) /* of a gain about 1: one that is neither that nor a fault says that no gain has changed */
 #define UNEXPLAINED REAL(0.1) /* of the energy of the innovations */
-#define UNEXPLAINED_INVERTED REAL(0.15)
+#define UNEXPLAINED_INVERTED REAL(0.13)
 #define CERTAIN REAL(25.0) /* variances: 5 sigma of a gain */
 #define JUMP REAL(20.0)    /* variances: 4.5 sigma of an innovation */
 #define WATCHED REAL(4.0)  /* variances: actuators are followed */

@@ -152,9 +152,8 @@ static uint32_t open_gate(law_t *law, real_t deviation)
     law->slow += d->high_pass_smoothing * (deviation - law->slow);
     const real_t above = deviation - law->slow;
     law->power += d->mean_square_smoothing * (above * above - law->power);
-    const real_t *past = law->past[0];
-    const real_t second =
-        deviation - REAL(2.0) * past[(law->sample - 1u) % LAW_PAST] + past[(law->sample - 2u) % LAW_PAST];
+    const real_t *past = &law->past[0][law->at_past]; /* of the sample before, and earlier */
+    const real_t second = deviation - REAL(2.0) * past[1] + past[2];
     law->noise += NOISE_SMOOTHING * d->mean_square_smoothing * (second * second / REAL(6.0) - law->noise);
     const real_t noise = real_max(d->gate_threshold, real_min(REAL(4.0) * law->noise, MOST_NOISE * d->gate_threshold));
     const uint32_t large = (law->power > noise) ? 1u : 0u;
@@ -172,18 +171,28 @@ static uint32_t open_gate(law_t *law, real_t deviation)
     return opens;
 }
 
-/* Force of the inner damper, F = -sum c_j dev[n - j]. */
+/* Note the deviation of this sample, at both places of the ring. */
+static void note_deviation(law_t *law, uint32_t coordinate, real_t deviation)
+{
+    law->past[coordinate][law->at_past] = deviation;
+    law->past[coordinate][law->at_past + LAW_PAST] = deviation;
+}
+
+/* Force of the inner damper, F = -sum c_j dev[n - j s] within its limit, s the distance of its taps. */
 static real_t damp(law_t *law, uint32_t coordinate, real_t deviation)
 {
+    const real_t *taps = law->design->taps[coordinate];
+    const real_t *past = &law->past[coordinate][law->at_past];
+    const real_t limit = law->design->damper_limit;
     real_t force = REAL(0.0);
-    law->past[coordinate][law->sample % LAW_PAST] = deviation;
+    note_deviation(law, coordinate, deviation);
     if ((law->damper_gain > REAL(0.0)) || (law->damper_scale < REAL(1.0))) {
         for (uint32_t j = 0u; j < LAW_DAMPER_TAPS; j++) {
-            force -= law->design->taps[coordinate][j] * law->past[coordinate][(law->sample - j) % LAW_PAST];
+            force -= taps[j] * past[j * LAW_TAP_STRIDE];
         }
     }
     law->damper_force[coordinate] = force;
-    return law->damper_gain * force;
+    return law->damper_gain * real_clip(force, -limit, limit);
 }
 
 /* Confidence in the sensors fades out within 20 ms while samples are invalid, and in again. */
@@ -197,7 +206,7 @@ static void update_confidence(law_t *law, uint32_t invalid)
 static void hold_deviations(law_t *law, real_t force[2])
 {
     for (uint32_t i = 0u; i < LAW_COORDINATES; i++) {
-        force[i] = damp(law, i, law->past[i][(law->sample - 1u) % LAW_PAST]);
+        force[i] = damp(law, i, law->past[i][law->at_past + 1u]);
     }
 }
 
@@ -366,9 +375,12 @@ uint32_t law_step(law_t *law, const real_t sensed[], real_t position, real_t ref
     bands_advance(law);
     const uint32_t learns = learning_follow_contact(law);
     take_reference(law, reference);
+    law->at_past = (law->at_past + LAW_PAST - 1u) % LAW_PAST;
     update_confidence(law, invalid);
     if (!(law->confidence > REAL(0.0))) {
         learning_reset(law, 0u, LAW_PARAMETERS);
+        note_deviation(law, 0u, REAL(0.0));
+        note_deviation(law, 1u, REAL(0.0));
     } else if (law->design->learns == 0u) {
         /* open loop */
     } else if (invalid != 0u) {

@@ -13,12 +13,11 @@
 
 #include <stdint.h>
 
-#include "design.h" /* LAW_BANDS, LAW_DELAY, LAW_COORDINATES, LAW_SENSORS, LAW_CHANNELS, LAW_DAMPER_TAPS */
+#include "design.h" /* LAW_BANDS, LAW_DELAY, LAW_COORDINATES, LAW_SENSORS, LAW_CHANNELS, LAW_DAMPER_TAPS, LAW_TAP_STRIDE, LAW_PAST */
 #include "real.h"
 
 #define LAW_FILTER_TAPS 12  /* of the derivatives' filters, 6 of them ahead */
 #define LAW_LOOKAHEAD (LAW_DELAY + LAW_FILTER_TAPS / 2)
-#define LAW_PAST (LAW_DAMPER_TAPS > 16 ? 64 : 16) /* samples of the inner damper, a power of two */
 #define LAW_BASIS 6         /* beta: r, r'/w_n, r''/w_n^2, r_p (r through the pair of poles), r_p'/w_p, D_00 r' T */
 #define LAW_RING (LAW_BASIS + 2) /* basis and deviation force of a sample, until they act */
 
@@ -75,7 +74,8 @@ typedef struct {
     real_t typical_speed, least_speed;  /* m/s; a slower finger sticks */
     real_t bias, least, attraction;     /* N, N, N per square of the peak: sqrt(max(bias + drive, least) / attraction) */
     /* inner damper */
-    real_t taps[2][LAW_DAMPER_TAPS]; /* N/m */
+    real_t taps[2][LAW_DAMPER_TAPS]; /* N/m, LAW_TAP_STRIDE samples apart */
+    real_t damper_limit;             /* N, in each coordinate, before its gain */
     real_t damper_high;              /* gain while it is open, 1 or 0 */
     real_t release;                  /* fall of the gain a sample */
     real_t gate_threshold, high_pass_smoothing, mean_square_smoothing; /* m^2 that opens it; a sample */
@@ -138,17 +138,17 @@ typedef struct law {
     real_t reference;                         /* m, what the sensors should show now */
     real_t basis[LAW_BASIS], poles[2];
     real_t ring[LAW_DELAY + 1][LAW_RING];
-    real_t past[2][LAW_PAST];                 /* deviations, a ring */
+    real_t past[2][2 * LAW_PAST];             /* deviations, newest first from `at_past` on; a ring, held twice */
     real_t slow, power, noise, fast_open;     /* of the damper's gate */
     real_t damper_gain, damper_scale;         /* of the damper; the scale is a supervisor's */
-    real_t damper_force[2];                   /* N, before its gain */
+    real_t damper_force[2];                   /* N, before its limit and gain */
     real_t moment, confidence;
     real_t peak, scale, smooth_scale;
     real_t shaper[2][LAW_CHANNELS];
     real_t measured_dc;
     real_t nominal_power, learned_power, reference_power; /* N^2, N^2, m^2: of law_mismatch */
     uint32_t hold_left, fast_timer;           /* samples */
-    uint32_t at_delayed, at_ring;             /* places in `delayed` and `ring` */
+    uint32_t at_delayed, at_ring, at_past;    /* places in `delayed`, `ring` and `past` */
     uint32_t sample;                          /* modulo 2^32 */
     uint32_t flags;                           /* of this sample */
 } law_t;

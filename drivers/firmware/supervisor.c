@@ -286,6 +286,19 @@ static uint32_t check_ringing(supervisor_t *s, law_t *law)
     return (s->ring_count >= p->ring_stop_time) ? 1u : 0u;
 }
 
+/* Test 4, by the damper: whether its force has been far beyond its limit for longer than in any contact. */
+static uint32_t check_limit(supervisor_t *s, const law_t *law)
+{
+    uint32_t over = 0u;
+    for (uint32_t i = 0u; i < 2u; i++) {
+        const real_t force = law->damper_gain * law->damper_force[i];
+        mean(&s->limit_energy[i], s->p->ring_smoothing, force * force);
+        over |= ((s->limit_energy[i] > s->p->most_damping) && (s->p->most_damping > REAL(0.0))) ? 1u : 0u;
+    }
+    s->limit_count = counted(s->limit_count, over);
+    return (s->limit_count >= s->p->limit_time) ? 1u : 0u;
+}
+
 /* Limit of the drive that the heat, the mean of its square, leaves. */
 static real_t limit_by_heat(const supervisor_t *s)
 {
@@ -358,6 +371,9 @@ static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed
     cause = ((cause == SUPERVISOR_FINE) || (found == SUPERVISOR_OVERMOTION)) ? found : cause;
     if ((s->p->damped != 0u) && (check_ringing(s, law) != 0u) && (cause == SUPERVISOR_FINE)) {
         cause = SUPERVISOR_RINGING;
+    }
+    if ((s->p->damped != 0u) && (check_limit(s, law) != 0u) && (cause == SUPERVISOR_FINE)) {
+        cause = SUPERVISOR_ACTIVE;
     }
     if ((s->p->compared != 0u) && (s->cause == SUPERVISOR_FINE)) {
         cause = compare_gains(s, cause, invalid);

@@ -31,9 +31,9 @@ typedef enum {
 typedef struct {
     real_t invalid_smoothing, frozen_drive, low, high, corner, top_gain, omega, energy_smoothing, power_smoothing;
     real_t drive_smoothing, ring_corner, ring_top_gain, ring_smoothing, lever, danger_motion, danger_drive, most_motion, most_drive;
-    real_t large_drive, sensed_bound, drive_limit, heat_smoothing, heat_gain, slow_smoothing, fade_out, fade_now;
+    real_t large_drive, most_damping, sensed_bound, drive_limit, heat_smoothing, heat_gain, slow_smoothing, fade_out, fade_now;
     uint32_t invalid_time, frozen_time, inconsistent_time, active_time, drive_time, ring_time, ring_wait_time;
-    uint32_t ring_stop_time, suspension_time, beyond_time, slow_time;
+    uint32_t ring_stop_time, suspension_time, beyond_time, slow_time, limit_time;
     uint32_t modelled;  /* 1: motion and drive are compared */
     uint32_t damped;    /* 1: the inner damper is watched */
     uint32_t limited;   /* 1: the law's drive limit follows the heat */
@@ -62,13 +62,14 @@ typedef struct {
     real_t forces[LAW_DELAY + 1][3]; /* N, N, A: forces and sum of the drive on their way */
     real_t force[2], input[4];
     real_t energy[12];               /* means of squares of q, v, a, dF, F, r in both coordinates */
-    real_t power[2], ring_energy[2], slow[4];
+    real_t power[2], ring_energy[2], limit_energy[2], slow[4];
     real_t drive_energy[LAW_CHANNELS], heat[LAW_CHANNELS];
     real_t last[LAW_SENSORS], least[LAW_SENSORS], most[LAW_SENSORS];
     real_t fade, fade_step, invalid, peak;
     real_t sensed_bound;             /* m: that of the settings, or a lower one */
     uint32_t repeats[LAW_SENSORS], longest[LAW_SENSORS];
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
+    uint32_t limit_count;
     uint32_t kept, broken; /* samples; see is_broken */
     uint32_t beyond_count, suspended, at, started;
     uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or wrong one; actuator */

@@ -177,7 +177,7 @@ def _settings(
         **_finger(model.finger),
         **_gains(model, bands, rules, feedback),
         **{name: getattr(model, name) for name in FROM_MODEL},
-        **damper_settings(model, damping.taps if damping else None),
+        **damper_settings(model, damping),
         "added_damping": np.append(added, [0.0])[:2],
         "waveform_gain": 2 * 2 * math.pi * observer * period,
         "extrapolation": 0.0,

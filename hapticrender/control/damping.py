@@ -52,10 +52,11 @@ class BendingMode:
 
 
 class Damping(NamedTuple):
-    """An inner damper; `choose_damping` makes it."""
+    """An inner damper; `choose_damping` and `load_damper.choose_load_damping` make it."""
 
     taps: Array  # (coordinates, n), N/m; zero where the damper is off
-    quality: float  # Q of each mode with its damper, where they differ the largest; inf where one is off
+    quality: float = math.inf  # Q of each mode with a viscous damper; inf where it is off, or of another kind
+    stride: int = 1  # samples from one tap to the next
 
     @property
     def on(self) -> bool:
@@ -126,21 +127,22 @@ def damping_taps(
 class DamperLoop:
     """Loop of one coordinate with its damper, exact in discrete time; a bending mode lies at its `frequency`."""
 
-    def __init__(self, part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> None:
-        self.part, self.taps = part, taps
+    def __init__(self, part: Oscillator, taps: Array, bending: BendingMode | None, c: int, stride: int = 1) -> None:
+        self.part, self.taps, self.stride = part, taps, stride
         self.modes = [(part.omega, max(part.ratio, LEAST_RATIO), part.mass)]
         if bending is not None and bending.coupling[c] != 0.0:
             ratio = max(bending.damping, LEAST_RATIO)
             self.modes.append((2 * np.pi * bending.frequency, ratio, 1.0 / bending.coupling[c]))
         omega, ratio, mass = np.array(self.modes).T
         diagonal = np.diag(mass), np.diag(2 * ratio * omega * mass), np.diag(omega**2 * mass)
-        self.plant = DiscretePlant.free(*diagonal, part.rate)
+        free = DiscretePlant.free(*diagonal, part.rate)  # one force drives all modes, the sensors show their sum
+        self.plant = replace(free, b=free.b.sum(axis=1, keepdims=True), c=free.c.sum(axis=0, keepdims=True))
 
     def response(self, frequency: Array) -> Array:
         """L at `frequency` (Hz), shape (n, 1, 1)."""
         z = np.exp(2j * np.pi * frequency / self.part.rate)
-        plant = self.plant.response(z).sum(axis=(1, 2))  # one force drives all modes, the sensors show their sum
-        return (plant * z**-self.part.delay * np.polyval(self.taps[::-1], 1 / z))[:, None, None]
+        plant = self.plant.response(z)[:, 0, 0]
+        return (plant * z**-self.part.delay * np.polyval(self.taps[::-1], z**-self.stride))[:, None, None]
 
     def grid(self) -> Array:
         """Frequencies (Hz) from 0 to half the rate, dense at each mode and fine enough for the delay."""
@@ -174,33 +176,21 @@ def damper_loops(
     return tuple(DamperLoop(part, taps[c], bending, c) for c, part in enumerate(parts))
 
 
-def choose_damping(model: DeviceModel, *, apart: bool = False) -> Damping:
+def choose_damping(model: DeviceModel) -> Damping:
     """Design the inner damper: the most damping whose margins hold, or none.
 
     Q rises in steps of 0.1 until every coordinate keeps the damper's least margins, with the bending mode where it was
     measured, and Ms stays below 5 with that mode at both ends of its tolerance.  Q starts at 1.4 where that mode is
     measured or the model is rigid, else at 2.  Where even a damper of 3.5 times the modes' own damping would not do,
     the damper is off.  Notched taps reach back 0.6 to 1 bending period; the reach with the least noise is taken.
-
-    `apart`: every coordinate has a damper of its own, or none; that of rocking, which a symmetric bending mode does not
-    couple into, starts at Q 1.4 and needs no notch.
     """
     if not (model.mass.diagonal() > 0.0).all():
-        return _off(len(model.mass))
+        return no_damping(len(model.mass))
     bending, parts = model.bending, oscillators(model)
     known = model.rigid if bending is None else bending.measured
     plain = model.taps or min(max(TAPS, 1 + round(REACH * model.rate)), MOST_TAPS)
     least = QUALITY if known else QUALITY_UNMEASURED
-    if not apart:
-        return _chosen(parts, least, bending, plain)
-    dampers = []
-    for i, part in enumerate(parts):
-        coupled = bending is not None and bending.coupling[i] != 0.0
-        mode = replace(bending, coupling=(bending.coupling[i],)) if bending is not None and coupled else None
-        dampers.append(_chosen((part,), least if coupled else QUALITY, mode, plain))
-    count = max(each.taps.shape[1] for each in dampers)
-    taps = [np.pad(each.taps, ((0, 0), (0, count - each.taps.shape[1]))) for each in dampers]
-    return Damping(np.vstack(taps), max(each.quality for each in dampers))
+    return _chosen(parts, least, bending, plain)
 
 
 def turns(parts: tuple[Oscillator, ...]) -> float:
@@ -213,7 +203,7 @@ def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: Bendin
     """Raise Q until the margins hold; `plain` taps where no bending mode is known."""
     largest = 1 / (2 * WORTH * max(*(part.ratio for part in parts), LEAST_RATIO))
     if largest < least_quality or turns(parts) > 1.0:  # the modes damp themselves, or the damper comes too late
-        return _off(len(parts))
+        return no_damping(len(parts))
     counts = [plain]  # numbers of taps worth trying
     if bending is not None:
         rate = parts[0].rate
@@ -226,7 +216,7 @@ def _chosen(parts: tuple[Oscillator, ...], least_quality: float, bending: Bendin
         if kept:
             noises = [max(loop.noise() for loop in damper_loops(parts, taps, bending)) for taps in kept]
             return Damping(kept[int(np.argmin(noises))], quality)
-    return _off(len(parts))
+    return no_damping(len(parts))
 
 
 def _holds(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | None) -> bool:
@@ -237,5 +227,6 @@ def _holds(parts: tuple[Oscillator, ...], taps: Array, bending: BendingMode | No
     return not any(bound.complaint(loop.margins(), loop.part.rate) for loop, bound in loops)
 
 
-def _off(coordinates: int) -> Damping:
+def no_damping(coordinates: int) -> Damping:
+    """Return a damper that is off."""
     return Damping(np.zeros((coordinates, TAPS)), math.inf)

@@ -10,7 +10,7 @@ import numpy as np
 from hapticrender.bands import Bands
 from hapticrender.control.controller import LEAST_TARGET, BankController, device_settings, padded, shared_settings
 from hapticrender.control.controller_design import design_controller, rules_for
-from hapticrender.control.damping import Damping, choose_damping
+from hapticrender.control.damping import Damping
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.control.inverse_kernel import REVERSION, SCALED, inverse_step
 from hapticrender.control.inverse_records import (
@@ -24,6 +24,7 @@ from hapticrender.control.inverse_records import (
     RING,
     TAPS,
 )
+from hapticrender.control.load_damper import choose_load_damping
 from hapticrender.control.records import MOST_CHANNELS, aligned
 from hapticrender.control.supervisor import damper_settings
 from hapticrender.defaults import FADE_IN
@@ -45,6 +46,7 @@ INNOVATIONS = 10.0  # weight of their mean square, times MODEL_ERROR^2: a tenth;
 LEAST_NOISE = 5e-5  # of the sensors' range
 REPORT_DELAY = 10e-3  # s: a contact is reported within this
 HOLD, DECAY = (50e-3, 2e-3), (20e-3, 2e-3)  # s, of the largest need; on friction a finger that turns makes it a spike
+DAMPER_LIMIT = 2.0  # N, of the inner damper in each coordinate: more than a touch takes
 GATE_SIGMAS = 2.0  # of the sensors' noise: a larger deviation (rms over 4 ms) opens the inner damper
 INITIAL_FRICTION = (1.0, 1e3)  # N and N/s: deviation and its rate at a contact
 INITIAL_MOTION = (15e-6, 0.02)  # m and m/s: deviation and its velocity at a contact
@@ -187,7 +189,7 @@ class AdaptiveInverse:
         beyond = bands.frequency.max(initial=0.0) > 1.2 * HIGHEST * model.rate  # of the filters' range
         if not known or beyond or (bands.envelope is None and len(bands)):
             return design_controller(self.name, model, bands, rules_for(bands), feedback=feedback)
-        damping = choose_damping(model, apart=True) if feedback else None
+        damping = choose_load_damping(model) if feedback else None
         if damping is not None and not (damping.on and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
@@ -227,7 +229,8 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         "lowest": LOWEST,
         "drive_step": model.drive_step,
         "damper_high": 1.0 if damping else 0.0,
-        **damper_settings(model, damping.taps if damping else None),
+        "damper_limit": DAMPER_LIMIT,
+        **damper_settings(model, damping),
         "release": period / 0.05,
     }
 

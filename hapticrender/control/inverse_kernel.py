@@ -42,7 +42,7 @@ from hapticrender.control.inverse_records import (
 )
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.peak_limit import NONFINITE, SATURATED, drive_of, shape_noise
-from hapticrender.control.records import CONTROLLER_T, LOCKED, MOST_TAPS, PAST_MASK, TILE_T, Y, samples_of
+from hapticrender.control.records import CONTROLLER_T, LOCKED, PAST, PAST_MASK, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, put, real, total, zeros
@@ -148,15 +148,18 @@ def open_gate(controller, inverse, deviation):
 
 @kernel
 def damp(controller, inverse, coordinate, deviation):
-    """Force of the inner damper, F = -sum c_j dev[n - j], and `damper_force` before its gain; `past` is a ring."""
+    """Force of the inner damper, F = -sum c_j dev[n - j s] within its limit; `damper_force` is before limit and gain.
+
+    s is the distance of its taps in samples; `past` is a ring.
+    """
     c = record(controller, CONTROLLER_T, 0)
     now, force = record(inverse, INVERSE_T, 0).sample & PAST_MASK, 0.0
     c.past[coordinate, now] = deviation
     if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
-            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j) & PAST_MASK]
+            force -= c.p.taps[coordinate, j] * c.past[coordinate, (now - j * c.p.tap_stride) & PAST_MASK]
     c.damper_force[coordinate] = force
-    return c.damping_gain * force
+    return c.damping_gain * min(max(force, -c.p.damper_limit), c.p.damper_limit)
 
 
 @kernel
@@ -225,7 +228,7 @@ def recover(controller, inverse):
         v.states[k, PARAMETERS] = 0.0
     for i in range(2):
         c.shaper[i, 0] = c.shaper[i, 1] = 0.0
-        for j in range(MOST_TAPS):
+        for j in range(PAST):
             c.past[i, j] = 0.0
     discretise(controller, inverse)
 
@@ -287,6 +290,7 @@ def inverse_step(state, signals, start, count):
         samples[FORCE, 0] = samples[FORCE + 1, 0] = 0.0  # the damper's, first
         if update_confidence(c, implausible):
             reset_parameters(inverse, FINGER, PARAMETERS)
+            c.past[0, v.sample & PAST_MASK] = c.past[1, v.sample & PAST_MASK] = 0.0
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
                 error0, error1 = c.past[0, (v.sample - 1) & PAST_MASK], c.past[1, (v.sample - 1) & PAST_MASK]

@@ -31,7 +31,7 @@ from hapticrender.control.records import (
     COORDINATE_T,
     INVERSE,
     LEAK,
-    MOST_TAPS,
+    PAST,
     PAST_MASK,
     POSITION,
     STEP,
@@ -275,7 +275,7 @@ def reset_loop(c):
             put(x, "slow", 0.0)
     for i in range(2):
         c.dc[i] = c.dc_drift[i] = 0.0
-        for j in range(MOST_TAPS):
+        for j in range(PAST):
             c.past[i, j] = 0.0
 
 

@@ -22,7 +22,9 @@ from hapticrender.vectors import W, tile_type
 
 MOST_SENSORS = MOST_CHANNELS = 8
 MOST_TAPS = 64  # of the inner damper, a power of two
-PAST_MASK = MOST_TAPS - 1  # of an index of the ring of its deviations
+MOST_STRIDE = 16  # samples from one of its taps to the next, a power of two
+PAST = MOST_TAPS * MOST_STRIDE  # deviations in its ring
+PAST_MASK = PAST - 1  # of an index of that
 LEAK = 50.0  # 1/s: error and integral of a carrier that has faded out decay at this rate
 FIXED, FADING, LOCKED = range(3)  # modes of a tile: nothing changes; its targets do; its carriers follow the finger
 SETPOINT_ROWS = 7  # frequency (Hz), wavenumber (1/m), phase (turns), target (re, im), sensor response (re, im)
@@ -80,7 +82,7 @@ _SETTINGS = """
 rate lead waveform_gain middle extrapolation fade_in lowest highest highest_edge modulated differentiated reads_waveform
 needs_contact least_speed sensor_delay contact_length corrected sensor_limit drive_limit drive_step peak_decay
 back_calculation observer observer_high crowd_speed dc dc_drift dc_fast dc_drift_fast
-integral integral_medium integral_high damper damper_high
+integral integral_medium integral_high damper damper_high damper_limit
 detects fast_smoothing slow_smoothing fast_threshold slow_threshold fast_time slow_time release
 contact_on contact_off contact_damping typical_speed lock
 adaptation adaptation_high rest rest_high age least_motion typical_mass typical_stiffness
@@ -101,7 +103,7 @@ SETTINGS = np.dtype(
         ("loop", np.float64, (5,)),
         *(
             (name, np.int64)
-            for name in "coordinates block group groups sensors channels n_taps window table late".split()
+            for name in "coordinates block group groups sensors channels n_taps tap_stride window table late".split()
         ),
     ]
 )
@@ -120,7 +122,7 @@ CONTROLLER = np.dtype(
         *((name, np.float64) for name in _STATE),
         *((name, np.float64, (2,)) for name in ("dc", "dc_drift", "deviation", "damper_force")),
         ("shaper", np.float64, (2, MOST_CHANNELS)),
-        ("past", np.float64, (2, MOST_TAPS)),
+        ("past", np.float64, (2, PAST)),
         *((name, np.int64) for name in ("sample", "tiles", "bands", "history", "locked", "stale", "implausible")),
         *((f"{name}_at", np.int64) for name in _ARRAYS.split()),
     ]

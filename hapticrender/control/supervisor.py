@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hapticrender.control.controller import BankController, padded
+from hapticrender.control.damping import Damping
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.control.gain_faults import GAINS, design_gains
 from hapticrender.control.records import CONTROLLER, MOST_CHANNELS, MOST_SENSORS, MOST_TAPS
@@ -47,7 +48,11 @@ DRIVE_TIME, PRESS_TIME, FASTEST_PACE = 30e-3, 60e-3, 6.0  # s, s; times of a fas
 PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a millisecond takes; its load
 SLIDE = 0.2  # m/s: a load that slides so fast is a moment that grows, and may be held against
 RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
-RINGING_MEAN, RINGING_TIME = 3e-3, 8e-3  # s: what a sudden lift-off leaves behind falls in this time from 15 sigma
+RINGING_MEAN, RINGING_TIME = 3e-3, 12e-3  # s: what a sudden lift-off leaves behind falls below 4 sigma in this time
+BEYOND_LIMIT, LIMIT_TIME = (
+    2.5,
+    15e-3,
+)  # of its limit, s: a press of 5 N in a millisecond near an end asks for it for 2 ms
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
@@ -336,10 +341,12 @@ def _ringing(controller: Any, model: DeviceModel, demand: Demand) -> dict[str, A
         return {}
     rate, g = model.rate, _trapezoidal(ringing_from(model), model.rate)
     needs_all = demand.drive > 0.7 * model.drive_limit
-    times = {"ring": RINGING_TIME, "ring_wait": RINGING_WAIT, "ring_stop": RINGING_STOP, "suspension": SATURATED_WAIT}
+    times = {"ring": RINGING_TIME, "ring_wait": RINGING_WAIT, "ring_stop": RINGING_STOP}
+    times |= {"suspension": SATURATED_WAIT, "limit": LIMIT_TIME}
     return {
         "controller": state.ctypes.data,
         "ringing": RINGING_VARIANCES * state["p"]["damper_noise"][0] ** 2,
+        "most_damping": (BEYOND_LIMIT * state["p"]["damper_limit"][0]) ** 2,
         "ring_corner": g,
         "ring_top_gain": 1.0 / (1.0 + g * (g + ROOT2)),
         "ring_smoothing": _smoothing(RINGING_MEAN, rate),
@@ -353,19 +360,20 @@ def ringing_from(model: DeviceModel) -> float:
     return min(max(RINGING_FROM, 1.5 * model.demand.highest if model.demand else 0.0), model.rate / 5)
 
 
-def damper_settings(model: DeviceModel, taps: Array | None) -> dict[str, Any]:
-    """Settings of a controller's inner damper with `taps` (c, t) in N/m, None where it has none.
+def damper_settings(model: DeviceModel, damping: Damping | None) -> dict[str, Any]:
+    """Settings of a controller's inner damper, None where it has none.
 
     ``damper_noise`` is its force beyond `ringing_from` (N rms, shape (2,)) by the sensors' noise.
     """
-    taps = np.zeros((len(model.mass), 1)) if taps is None else taps
+    taps, stride = (damping.taps, damping.stride) if damping else (np.zeros((len(model.mass), 1)), 1)
     turn = np.pi * (np.arange(512) + 0.5) / 512
     s = 1j * np.tan(turn / 2) / _trapezoidal(ringing_from(model), model.rate)
     passed = abs(s * s / (s * s + ROOT2 * s + 1.0)) ** 4
-    response = np.exp(-1j * np.outer(turn, np.arange(taps.shape[1]))) @ taps.T  # (512, c)
+    response = np.exp(-1j * np.outer(turn, stride * np.arange(taps.shape[1]))) @ taps.T  # (512, c)
     power = (passed[:, None] * abs(response) ** 2).mean(axis=0) * (model.coordinate_from_sensed**2).sum(axis=1)
     noise = np.append(sensor_noise(model) * np.sqrt(power), [0.0, 0.0])[:2]
-    return {"n_taps": taps.shape[1], "taps": padded(taps, 2, MOST_TAPS), "damper_noise": noise}
+    padded_taps = padded(taps, 2, MOST_TAPS)
+    return {"n_taps": taps.shape[1], "tap_stride": stride, "taps": padded_taps, "damper_noise": noise}
 
 
 def _residual_noise(model: DeviceModel, i: int, corner: float, low_end: float) -> float:

@@ -16,8 +16,9 @@ no  cause        condition                                                      
 3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
                  or > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s ("slowly")       0.3 s
+                 or the inner damper asks for more than 2.5 times its limit, rms over 3 ms        15 ms
 5   drive        mean of u^2 > (1.5 B + A/2.4)^2/2: more than any finger takes                    30 ms (mean) + 60 ms
-6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   8 ms
+6   ringing      inner damper's force beyond 500 Hz and 1.5 times the carriers > 4 times its noise   12 ms
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
 9   sensor gain  a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
@@ -68,10 +69,12 @@ JUMP_INVALID = 0.9  # of what one invalid sample, whose value is held, adds to t
 _SETTINGS = """
 sensor_limit invalid_smoothing frozen_drive low high corner top_gain omega energy_smoothing power_smoothing
 drive_smoothing ring_corner ring_top_gain ring_smoothing lever danger_motion danger_drive most_motion most_drive
-large_drive sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing
+large_drive most_damping sensed_bound drive_limit heat_smoothing heat_gain slow_smoothing
 fade_out fade_now least_friction friction_smoothing
 """.split()
-_TIMES = "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow".split()  # samples
+_TIMES = (
+    "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow limit".split()
+)  # samples
 SETTINGS = np.dtype(
     [
         *((name, np.float64) for name in _SETTINGS),
@@ -88,7 +91,7 @@ SETTINGS = np.dtype(
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them: factors and fades per sample, times in samples."""
-COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow")
+COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow", "limit")
 SUPERVISOR = np.dtype(
     [
         ("p", SETTINGS),
@@ -98,7 +101,7 @@ SUPERVISOR = np.dtype(
         ),
         *((name, np.float64, (4,)) for name in ("input", "low", "high", "band", "level", "value", "rate", "change")),
         *((name, np.float64, (4,)) for name in ("ring_band", "ring_level")),
-        *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy")),
+        *((name, np.float64, (2,)) for name in ("force", "power", "ring_energy", "limit_energy")),
         ("friction", np.float64, (4,)),  # of test 12: mean until three samples ago, and those three, oldest first
         ("slow", np.float64, (4,)),  # means of the slow test 4: -r v, and the squares of v, F and r
         ("signals", np.float64, (12,)),  # q, v, a, dF, F, r in both coordinates, and their energies
@@ -346,6 +349,19 @@ def check_ringing(supervisor):
 
 
 @kernel
+def check_limit(supervisor):
+    """Test 4, by the damper: whether its force has been far beyond its limit for longer than in any contact."""
+    s = record(supervisor, SUPERVISOR_T, 0)
+    p, c, over = s.p, record(s.p.controller, CONTROLLER_T, 0), False
+    for i in range(2):
+        force = c.damping_gain * c.damper_force[i]
+        s.limit_energy[i] += p.ring_smoothing * (force * force - s.limit_energy[i])
+        over |= s.limit_energy[i] > p.most_damping > 0.0
+    s.limit_count = s.limit_count + 1 if over else 0
+    return s.limit_count >= p.limit_time
+
+
+@kernel
 def limit_rms_drive(supervisor, drive, flags, n):
     """Cut a sample's drive to the limit that its heat leaves, and return the next sample's limit.
 
@@ -393,6 +409,8 @@ def supervise(supervisor, sensed, position, drive, flags, n):
         cause = found if cause == 0 or found == OVERMOTION else cause
         if p.controller != 0 and check_ringing(supervisor) and cause == 0:
             cause = RINGING
+        if p.controller != 0 and check_limit(supervisor) and cause == 0:
+            cause = ACTIVE
         if p.gains != 0 and s.cause == 0:
             found, which = compare_gains(supervisor, invalid)
             if found > 0 and cause == 0:

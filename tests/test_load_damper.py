@@ -1,0 +1,127 @@
+"""The damper by least squares: what it leaves of a load, its margins against exact poles, and where it is off."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_damping import bending, growth, heave_loop, heave_plant, loop_of, model_of
+
+from hapticrender.control.damping import choose_damping, oscillators
+from hapticrender.control.load_damper import EFFORT_STEP, LOW_END, LeastSquares, choose_load_damping, margins_hold
+from hapticrender.control.margins import LEAST
+from hapticrender.plants.plate import EXPECTED_BENDING, PlateParameters
+
+DEVICES = [(5000, 1), (5000, 25), (2000, 1), (48000, 64)]  # Hz, samples
+
+
+def expected_of(rate, delay=1):
+    """A plate that was not measured, whose bending mode may lie from 1.1 to 1.4 kHz, with either sign."""
+    return replace(model_of(rate, delay), bending=EXPECTED_BENDING)
+
+
+def every_sample(damping):
+    """Taps (c, n), N/m, of every sample, with zeros between."""
+    taps = np.zeros((len(damping.taps), damping.stride * damping.taps.shape[1]))
+    taps[:, :: damping.stride] = damping.taps
+    return taps
+
+
+def ringing(rate, delay, taps):
+    """Motion of heave above `LOW_END` by a step of a load (rms, up to a factor), from that by a load of one sample."""
+    plant, x, motions = heave_plant(rate), np.zeros((2, 1)), np.zeros(rate)
+    forces, past = np.zeros(delay + 1), np.zeros(len(taps))
+    for n in range(rate):
+        motions[n] = (plant.c @ x).item()
+        past = np.concatenate([[motions[n]], past[:-1]])
+        forces = np.concatenate([forces[1:], [-taps @ past]])
+        x = plant.a @ x + plant.b * ((n == 0) + forces[0])
+    spectrum = np.fft.rfft(motions)[round(LOW_END) :]
+    return float(np.sqrt(np.sum(abs(spectrum / np.arange(LOW_END, rate / 2 + 1)) ** 2)))
+
+
+@pytest.mark.parametrize(
+    ("rate", "delay", "most"), [(5000, 1, 0.75), (5000, 25, 0.97), (2000, 1, 0.9), (20000, 4, 0.9)]
+)
+def test_a_load_leaves_less_than_with_the_viscous_damper(rate, delay, most):
+    """Sample by sample, not by the design's integral; `most` of what is left without the improvement."""
+    model = expected_of(rate, delay)
+    viscous, chosen = (every_sample(choose(model))[0] for choose in (choose_damping, choose_load_damping))
+    assert ringing(rate, delay, chosen) < most * ringing(rate, delay, viscous)
+
+
+def test_what_is_left_is_that_of_the_exact_loop():
+    """The design's integral over frequency, in steps of 0.5 Hz, against the loop sample by sample, in steps of 1 Hz."""
+    model = expected_of(5000)
+    part, taps = oscillators(model)[0], choose_load_damping(model).taps[0]
+    left = LeastSquares(part, model.bending, 0, rigid=False).left(taps)
+    assert ringing(5000, 1, taps) / ringing(5000, 1, 0.0 * taps) == pytest.approx(left, rel=0.01)
+
+
+@pytest.mark.parametrize(("rate", "delay"), DEVICES)
+def test_margins_hold_and_are_where_the_exact_poles_cross(rate, delay):
+    """Poles of a matrix beside margins by frequency, on both sides of the gain margin; no static force."""
+    chosen = choose_load_damping(expected_of(rate, delay))
+    taps, parts = every_sample(chosen), oscillators(model_of(rate, delay))
+    assert abs(chosen.taps.sum(axis=1)).max() < 1e-9 * abs(chosen.taps).max()
+    for c, part in enumerate(parts):
+        assert margins_hold(part, chosen.taps[c], EXPECTED_BENDING, c)
+    if rate > 5000:
+        return  # its matrix has 400 states
+    margins = heave_loop(model_of(rate, delay), taps).margins()
+    assert LEAST["damper"].complaint(margins, rate) == ""
+    plant = heave_plant(rate)
+    assert growth(loop_of(plant, 0.999 * margins.gain * taps[:1], delay)) < 1e-3
+    assert growth(loop_of(plant, 1.001 * margins.gain * taps[:1], delay)) > 0.0
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("frequency", [1100.0, 1180.0, 1250.0, 1330.0, 1400.0])
+def test_a_mode_wherever_it_is_expected_stays_stable(frequency, late, sign):
+    """By exact poles; a damper that knows of none makes one of them grow."""
+    mode = bending(0.1 * sign, frequency)
+    chosen = choose_load_damping(expected_of(5000)).taps[:1]
+    assert growth(loop_of(heave_plant(5000, mode), chosen, 1 + late)) < 1e-3
+
+
+def test_a_damper_that_knows_of_no_mode_drives_one():
+    """The other side: designed for a rigid plate."""
+    rigid = choose_load_damping(replace(model_of(5000), rigid=True)).taps[:1]
+    grows = [growth(loop_of(heave_plant(5000, bending(coil, 1100.0)), rigid, 1)) for coil in (-0.1, 0.1)]
+    assert max(grows) > 1.0
+
+
+@pytest.mark.parametrize("coil", [-0.1, 0.1])
+def test_a_measured_mode_is_part_of_the_design(coil):
+    """It may lie 100 Hz off on either side, and more is damped than beside an expected one of either sign."""
+    model = replace(model_of(5000), bending=bending(coil))
+    chosen = choose_load_damping(model)
+    for frequency in (1050.0, 1100.0, 1150.0, 1200.0, 1250.0):
+        assert growth(loop_of(heave_plant(5000, bending(coil, frequency)), chosen.taps[:1], 1)) < 1e-3
+    viscous = choose_damping(model)
+    assert ringing(5000, 1, chosen.taps[0]) < 0.95 * ringing(5000, 1, viscous.taps[0])
+
+
+def test_it_is_the_strongest_whose_margins_hold():
+    """With a weight of the force one step less a margin fails; a quarter more gain fails, too."""
+    model = replace(model_of(5000), rigid=True)
+    part, chosen = oscillators(model)[0], choose_load_damping(model).taps[0]
+    design = LeastSquares(part, None, 0, rigid=True)
+    weights = 0.5 * EFFORT_STEP ** np.arange(300)
+    holds = [margins_hold(part, design.taps(float(weight)), None, 0) for weight in weights[::10]]
+    first = int(np.argmax(holds))
+    assert 0 < first
+    assert all(holds[first:])  # bisection finds it
+    found = next(weight for weight in weights if margins_hold(part, design.taps(float(weight)), None, 0))
+    np.testing.assert_allclose(chosen, design.taps(float(found)), rtol=1e-9)
+    assert not margins_hold(part, 1.25 * chosen, None, 0)
+
+
+def test_it_is_off_where_none_would_help():
+    """No mass, a mode that damps itself, a loop that comes a period late; rocking alone where heave's is too late."""
+    friction = replace(model_of(5000), mass=np.zeros((2, 2)))
+    viscous = PlateParameters(damping_1=20.0, damping_2=20.0).device_model(5000.0, 1)
+    for model in (friction, viscous, model_of(48000, 400)):
+        assert not choose_load_damping(model).on
+    late = choose_load_damping(model_of(48000, 256))
+    assert late.taps.any(axis=1).tolist() == [False, True]
