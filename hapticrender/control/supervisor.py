@@ -49,10 +49,7 @@ PRESS, PRESS_LOAD = 9.0, 5.0  # N: 1.5 times the force that a press of 5 N in a 
 SLIDE = 0.2  # m/s: a load that slides so fast is a moment that grows, and may be held against
 RINGING_FROM, RINGING_VARIANCES = 500.0, 16.0  # Hz, 4 sigma
 RINGING_MEAN, RINGING_TIME = 3e-3, 12e-3  # s: what a sudden lift-off leaves behind falls below 4 sigma in this time
-BEYOND_LIMIT, LIMIT_TIME = (
-    2.5,
-    15e-3,
-)  # of its limit, s: a press of 5 N in a millisecond near an end asks for it for 2 ms
+BEYOND_LIMIT, LIMIT_TIME = 2.5, 15e-3  # of its limit, s: what 5 N in a millisecond near an end take lasts 2 ms
 RINGING_WAIT, RINGING_STOP, SATURATED_WAIT = 10e-3, 150e-3, 0.5  # s
 SLOW_MEAN, SLOW_TIME = 0.2, 0.3  # s
 BEYOND_TIME = 10e-3  # s: three samples in it are no spikes
