@@ -22,7 +22,7 @@ from hapticrender.bands import Bands
 from hapticrender.export import export
 
 PREFIX = "arm-none-eabi-"
-FLAGS = "-std=c99 -O2 -funroll-loops -ffp-contract=off -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
+FLAGS = "-std=c99 -O3 -funroll-loops -ffp-contract=off -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16"
 LINK = "-nostartfiles -T m4.ld -ffunction-sections -fdata-sections -Wl,--gc-sections"
 MACHINE = "qemu-system-arm -M mps2-an386 -display none -monitor none -serial none"
 MACHINE += " -semihosting-config enable=on,target=native -icount shift=6"
