@@ -12,9 +12,8 @@ from strangers_plate import StrangersPlate
 import hapticrender as hr
 from benchmarks import faults
 from benchmarks.false_stops import Hidden, random_scene, run
-from hapticrender.control import supervisor
+from hapticrender.control import inverse, supervisor
 from hapticrender.control.gain_faults import WANDER, design_gains
-from hapticrender.control.inverse import DAMPER_LIMIT
 from hapticrender.control.probe import judge, probe_drive, probe_plate
 from hapticrender.mathx import zoh
 from hapticrender.plants.plate import Plate, PlateParameters
@@ -307,7 +306,9 @@ def test_the_default_damper_that_rings_on_a_strangers_plate_is_turned_down(frequ
             drive = hr.run(rendering if supervised else bare).drive
         ends.append(abs(drive[-1000:]).max() * abs(rendering.model.force_from_drive).max())
     assert ends[0] < 1.0  # N of a coil: the texture takes 0.96
-    assert ends[0] + 0.5 * DAMPER_LIMIT < ends[1] <= ends[0] + DAMPER_LIMIT  # a coil has half of heave and of rocking
+    assert (
+        ends[0] + 0.5 * inverse.DAMPER_LIMIT < ends[1] <= ends[0] + inverse.DAMPER_LIMIT
+    )  # a coil has half of heave and of rocking
 
 
 @pytest.mark.parametrize(("limit_time", "stops"), [(supervisor.LIMIT_TIME, True), (10.0, False)])
@@ -320,6 +321,19 @@ def test_what_makes_the_damper_ask_for_far_more_than_its_limit_is_found(monkeypa
         stopped, _, motion, message = faults.run(plate, hr.Grating(frequency=400.0, amplitude=50e-6))
     assert np.isfinite(stopped) == stops
     assert not stops or (stopped < 0.2 and motion < 1e-3 and "the motion grows with the drive" in message)
+
+
+@pytest.mark.parametrize(("limit", "least", "most"), [(inverse.DAMPER_LIMIT, 0.0, 0.5e-3), (1.5, 0.5e-3, np.inf)])
+@pytest.mark.parametrize(("start", "gains"), [(0.3, (-1.0, 1.0)), (0.503, (1.0, -1.0))])
+def test_one_inverted_sensor_is_found_where_the_damper_may_use_enough_force(
+    monkeypatch, limit, least, most, start, gains
+):
+    """At phases without a jump of the sensed value; with less the motion is not compared with so small a drive."""
+    monkeypatch.setattr(inverse, "DAMPER_LIMIT", limit)
+    plate = Watched(lambda plate, sensed: sensed * gains, start=start)
+    with pytest.raises(hr.DeviceFault):
+        hr.render(scene(72.0, 10e-6), driver=plate)
+    assert least < max(plate.motion) < most
 
 
 @pytest.mark.parametrize("ramp", [1e-3, 2e-3])

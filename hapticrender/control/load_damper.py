@@ -59,9 +59,9 @@ class LeastSquares:
             folded = abs(bending.frequency - part.rate * round(bending.frequency / part.rate))
             self.noise[abs(frequency - folded) <= WIDE * bending.spread] += NOTCH
 
-    def solved(self, weight: Array, wanted: Array, count: int) -> Array:
-        """FIR filter x (count,), of sum zero, with the least integral of ``weight |x|^2 - 2 Re(conj(x) wanted)``."""
-        rows, right = (np.fft.irfft(each, self.size)[: count * self.stride : self.stride] for each in (weight, wanted))
+    def solved(self, weight: Array, linear: Array, count: int) -> Array:
+        """FIR filter x (count,), of sum zero, with the least integral of ``weight |x|^2 - 2 Re(conj(x) linear)``."""
+        rows, right = (np.fft.irfft(each, self.size)[: count * self.stride : self.stride] for each in (weight, linear))
         rows[0] *= 1.0 + RIDGE
         free, static = solve_toeplitz(rows, np.stack([right, np.ones(count)], axis=1)).T
         return np.asarray(free - free.sum() / static.sum() * static)
