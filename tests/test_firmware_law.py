@@ -113,6 +113,10 @@ FAULTS = {
     "inverted": (causes.INCONSISTENT, lambda sensed: -sensed),
     "swings far": (causes.OVERMOTION, lambda sensed: 0.95e-3 * np.sin(0.12 * np.arange(len(sensed)))),
     "rings": (causes.RINGING, lambda sensed: sensed + 15e-6 * np.sin(1.6 * np.arange(len(sensed)))),
+    "moves the damper's force far": (
+        causes.ACTIVE,
+        lambda sensed: sensed + 4e-4 * np.sin(0.5 * np.arange(len(sensed))),
+    ),
     "another tone": (causes.ACTIVE, lambda sensed: 100e-6 * np.sin(0.25 * np.arange(len(sensed)))),
 }
 

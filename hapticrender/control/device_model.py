@@ -82,7 +82,7 @@ class DeviceModel:
     sensor_delay: float = 0.0  # s, of the sensor against the evaluation point; negative: a lead
     contact_length: float = 0.0  # m: length by which a sliding contact lags behind what the sensor measures
     lock: float = 0.0  # Hz, of the resonance lock, which moves fixed carriers to where the device is resonant; 0: none
-    taps: int | None = None  # >= 3, of the inner damper without a bending mode; None: as many as reach 0.4 ms back
+    taps: int | None = None  # >= 3, of the viscous damper without a bending mode; None: as many as reach 0.4 ms back
     late: bool = False  # the motion is to follow after the delay; else at once, for which the feedback has to act
     always_damped: bool = False  # the damper stays on at low gains: its noise costs less than the onset of a contact
     unit: str = "m"  # of the coordinates

@@ -7,6 +7,7 @@ to its feedback.  Equations: docs/theory.md, "Inner damper"; why: docs/decisions
 """
 
 import math
+from bisect import bisect_left
 from functools import lru_cache
 
 import numpy as np
@@ -32,25 +33,24 @@ from hapticrender.protocols import Array
 TAPS, SPACING = 40, 0.2e-3  # s, of the taps
 LENGTH = 128  # of q
 RESOLUTION = 0.5  # Hz, of the integrals over frequency
-LOW_END = 40.0  # Hz: what a load moves more slowly is left
+LOW_END = 40.0  # Hz: below it what a load moves counts less and less
 NOISE = 3e-5  # nu: weight of |q|^2, white noise through the damper, over that of the load
 RESERVE, RESERVE_FROM = 5e-4, 450.0  # n; Hz: further weight of |q|^2 above it, for modes that nothing states ...
-NOTCH, WIDE = 0.1, 1.3  # ... and where a bending mode is expected, within so many of its spreads
-RIDGE = 1e-8  # of the normal equations
-LEAST_EFFORT, EFFORT_STEP, STEPS = 0.5, 1.01, 1023  # rho, the weight of the load's force, that are tried
+NOTCH, WIDE = 0.1, 1.3  # ... and where a bending mode is stated, within so many of its spreads
+LEAST_EFFORT, EFFORT_STEP, STEPS = 0.5, 1.01, 1024  # rho, the weight of the load's force, that are tried
 
 
 class LeastSquares:
-    """Least squares for the damper of coordinate `c`, with its `bending` mode; None: there is none, or not known."""
+    """Least squares for the damper of coordinate `c`; the `bending` mode is kept free of it (None: not known)."""
 
     def __init__(self, part: Oscillator, bending: BendingMode | None, c: int, rigid: bool) -> None:
         self.stride = tap_stride(part.rate)
         self.size = next_fast_len(math.ceil(part.rate / RESOLUTION), real=True)
         self.k = part.mass * part.omega**2
         frequency = np.fft.rfftfreq(self.size, 1.0 / part.rate)
-        self.p = self.k * DamperLoop(part, np.ones(1), known_mode(bending), c).response(frequency)[:, 0, 0]
-        ratio = part.omega / (2 * np.pi * np.maximum(frequency, LOW_END))
-        self.load = np.where(frequency >= LOW_END, np.abs(ratio * self.p) ** 2, 0.0)
+        self.p = self.k * DamperLoop(part, np.ones(1), None, c).response(frequency)[:, 0, 0]
+        step = part.omega / (2 * np.pi) * frequency / np.maximum(frequency, LOW_END) ** 2
+        self.load = np.abs(step * self.p) ** 2
         self.noise = np.full(len(frequency), NOISE)
         coupled = bending is not None and bending.coupling[c] != 0.0
         if coupled or not (rigid or bending):
@@ -62,7 +62,6 @@ class LeastSquares:
     def solved(self, weight: Array, linear: Array, count: int) -> Array:
         """FIR filter x (count,), of sum zero, with the least integral of ``weight |x|^2 - 2 Re(conj(x) linear)``."""
         rows, right = (np.fft.irfft(each, self.size)[: count * self.stride : self.stride] for each in (weight, linear))
-        rows[0] *= 1.0 + RIDGE
         free, static = solve_toeplitz(rows, np.stack([right, np.ones(count)], axis=1)).T
         return np.asarray(free - free.sum() / static.sum() * static)
 
@@ -81,7 +80,7 @@ class LeastSquares:
         return self.k * self.solved(weight, weight * q / sensitivity, TAPS)
 
     def left(self, taps: Array) -> float:
-        """What a load's step leaves above `LOW_END` with taps (N/m), over what it leaves without a damper, rms."""
+        """What a load's step leaves with taps (N/m), over what it leaves without a damper, rms with `load`'s weight."""
         left = self.load / np.abs(1.0 + self.p * self.response(taps / self.k)) ** 2
         return float(np.sqrt(left.sum() / self.load.sum()))
 
@@ -91,18 +90,13 @@ def tap_stride(rate: float) -> int:
     return min(max(round(SPACING * rate), 1), MOST_STRIDE)
 
 
-def known_mode(bending: BendingMode | None) -> BendingMode | None:
-    """The bending mode where it was measured."""
-    return bending if bending is not None and bending.measured else None
-
-
 def choose_load_damping(model: DeviceModel) -> Damping:
     """Design the inner damper of a device model: in each coordinate the strongest whose margins hold, or none.
 
     rho, the weight of the force, is the least, in steps of 1 %, with which the margins of `margins.LEAST` hold: those
-    of the damper with the bending mode where it was measured, those of the spread at the ends of its tolerance, also a
-    sample later.  A coordinate has no damper where its own damping is a good part of what one would add, where the loop
-    comes a period late, or where no rho will do.
+    of the damper with the bending mode where it was measured, those of the spread at the ends of its tolerance, of a
+    mode that is only expected also a sample later.  A coordinate has no damper where its own damping is a good part of
+    what one would add, where the loop comes a period late, or where no rho will do.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return no_damping(len(model.mass))
@@ -115,20 +109,18 @@ def _chosen(part: Oscillator, bending: BendingMode | None, c: int, rigid: bool) 
     """Taps of one coordinate; zeros where it has no damper."""
     if part.ratio > 1.0 / (2.0 * WORTH * QUALITY) or turns((part,)) > 1.0:
         return np.zeros(TAPS)
-    design, low, high = LeastSquares(part, bending, c, rigid), -1, STEPS
-    while high - low > 1:
-        middle = (low + high) // 2
-        holds = margins_hold(part, design.taps(LEAST_EFFORT * EFFORT_STEP**middle), bending, c)
-        low, high = (low, middle) if holds else (middle, high)
-    found = design.taps(LEAST_EFFORT * EFFORT_STEP**high)
-    return found if margins_hold(part, found, bending, c) else np.zeros(TAPS)
+    design = LeastSquares(part, bending, c, rigid)
+    efforts = LEAST_EFFORT * EFFORT_STEP ** np.arange(STEPS)
+    first = bisect_left(efforts, True, key=lambda rho: margins_hold(part, design.taps(rho), bending, c))
+    return design.taps(efforts[first]) if first < STEPS else np.zeros(TAPS)
 
 
 def margins_hold(part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> bool:
     """Whether all margins hold with the taps of coordinate `c`, with the bending mode wherever it may lie."""
-    cases = [(part, known_mode(bending), LEAST["damper"])]
+    cases = [(part, bending if bending is not None and bending.measured else None, LEAST["damper"])]
     if bending is not None and bending.coupling[c] != 0.0:
-        late = part._replace(delay=part.delay + 1)
-        cases += [(each, corner, LEAST["spread"]) for corner in bending.corners() for each in (part, late)]
+        delays = (0,) if bending.measured else (0, 1)  # the delay was measured with the mode
+        parts = [part._replace(delay=part.delay + late) for late in delays]
+        cases += [(each, corner, LEAST["spread"]) for corner in bending.corners() for each in parts]
     loops = ((DamperLoop(each, taps, mode, c, tap_stride(part.rate)), bound) for each, mode, bound in cases)
     return not any(bound.complaint(loop.margins(), part.rate) for loop, bound in loops)
