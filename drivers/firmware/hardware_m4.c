@@ -24,28 +24,16 @@ uint32_t hardware_cycles(void) { return ~TIMER0_VALUE; }
 uint32_t hardware_wait(void)
 {
     static uint32_t last;
-    plate_advance(&plate, 1.0 / (double)design.rate, (double)board.position, (double)board.finger.load);
+    plate_advance(&plate, board.position, board.finger.load);
     while (hardware_cycles() - last < TICK) {
     }
     last = hardware_cycles();
     return 1u;
 }
 
-void hardware_sense(real_t sensed[])
-{
-    double values[2];
-    plate_sense(&plate, values);
-    for (uint32_t s = 0u; s < LAW_SENSORS; s++) {
-        sensed[s] = (LAW_FRICTION != 0u) ? REAL(0.0) : (real_t)values[s];
-    }
-}
+void hardware_sense(real_t sensed[]) { plate_sense(&plate, sensed); }
 
-void hardware_drive(const real_t drive[])
-{
-    for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
-        plate.next[c] = (double)drive[c];
-    }
-}
+void hardware_drive(const real_t drive[]) { plate_drive(&plate, drive); }
 
 size_t hardware_read(uint8_t bytes[], size_t most)
 {

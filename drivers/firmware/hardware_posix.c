@@ -113,7 +113,7 @@ static void wait_for_clock(void)
 
 uint32_t hardware_wait(void)
 {
-    plate_advance(&plate, 1.0 / (double)design.rate, (double)board.position, (double)board.finger.load);
+    plate_advance(&plate, board.position, board.finger.load);
     if (!stepped) {
         wait_for_clock();
         return ended ? 0u : 1u;
@@ -129,20 +129,13 @@ uint32_t hardware_wait(void)
 
 void hardware_sense(real_t sensed[])
 {
-    double values[2];
-    plate_sense(&plate, values);
+    plate_sense(&plate, sensed);
     for (uint32_t s = 0; s < LAW_SENSORS; s++) {
-        values[s] *= board.sample >= failing ? gain[s] : 1.0;
-        sensed[s] = LAW_FRICTION != 0u ? REAL(0.0) : (real_t)values[s];
+        sensed[s] *= board.sample >= failing ? (real_t)gain[s] : REAL(1.0);
     }
 }
 
-void hardware_drive(const real_t drive[])
-{
-    for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
-        plate.next[c] = (double)drive[c];
-    }
-}
+void hardware_drive(const real_t drive[]) { plate_drive(&plate, drive); }
 
 size_t hardware_read(uint8_t bytes[], size_t most)
 {

@@ -17,7 +17,7 @@
 #define LANDS 500u   /* sample at which the finger lands; the initial motion of a contact is learned for 0.16 s */
 #endif
 #define SPEED 0.08   /* m/s */
-#define LOAD 0.4     /* N */
+#define LOAD REAL(0.4) /* N */
 
 static law_t law;
 static supervisor_t supervisor;
@@ -143,24 +143,22 @@ int main(void)
     law_init(&law, &design);
     supervisor_init(&supervisor, &supervision, &design);
     for (uint32_t n = 0u; n < SAMPLES; n++) {
-        double sensed[2];
+        real_t sensed[LAW_SENSORS];
         real_t drive[LAW_CHANNELS] = {REAL(0.0)};
         const real_t waveform = (design.bands_used == 0u) ? next_waveform() : REAL(0.0);
         const double position = (n < LANDS) ? NAN : (SPEED / (double)design.rate * (double)(n - LANDS) - 0.02);
         plate_sense(&plate, sensed);
-        const real_t shown[2] = {(real_t)sensed[0], (real_t)sensed[1]};
         const uint32_t start = measure_count();
 #ifdef SUPERVISED
-        flags |= supervisor_step(&supervisor, &law, shown, (real_t)position, waveform, drive);
+        flags |= supervisor_step(&supervisor, &law, sensed, (real_t)position, waveform, drive);
 #else
-        flags |= law_step(&law, shown, (real_t)position, waveform, drive);
+        flags |= law_step(&law, sensed, (real_t)position, waveform, drive);
 #endif
         const uint32_t taken = measure_count() - start - empty;
         most = (taken > most) ? taken : most;
         sums[(n < LANDS) ? 0 : ((n < LANDS + design.initial_end) ? 1 : 2)] += (double)taken;
-        plate_advance(&plate, 1.0 / (double)design.rate, position, LOAD);
-        plate.drive[0] = (double)drive[0];
-        plate.drive[LAW_CHANNELS - 1] = (double)drive[LAW_CHANNELS - 1];
+        plate_drive(&plate, drive);
+        plate_advance(&plate, (real_t)position, LOAD);
     }
     print_number("free", sums[0] / LANDS);
     print_number("new", sums[1] / design.initial_end);

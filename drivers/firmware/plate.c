@@ -39,12 +39,21 @@ static double uniform(plate_t *plate)
     return ((double)((x * 2685821657736338717u) >> 11) + 1.0) / 9007199254740992.0;
 }
 
-void plate_sense(plate_t *plate, double sensed[2])
+void plate_sense(plate_t *plate, real_t sensed[LAW_SENSORS])
 {
     double size = plate->noise * sqrt(-2.0 * log(uniform(plate))), angle = TWO_PI * uniform(plate);
     double rocking = plate->state[1] * HALF_LENGTH / HALF_SPACING;
-    sensed[0] = quantise(plate->state[0] - rocking + size * cos(angle), SENSOR_STEP, SENSOR_LIMIT);
-    sensed[1] = quantise(plate->state[0] + rocking + size * sin(angle), SENSOR_STEP, SENSOR_LIMIT);
+    double ends[2] = {plate->state[0] - rocking + size * cos(angle), plate->state[0] + rocking + size * sin(angle)};
+    for (uint32_t s = 0; s < LAW_SENSORS; s++) {
+        sensed[s] = LAW_FRICTION != 0u ? REAL(0.0) : (real_t)quantise(ends[s], SENSOR_STEP, SENSOR_LIMIT);
+    }
+}
+
+void plate_drive(plate_t *plate, const real_t drive[LAW_CHANNELS])
+{
+    for (uint32_t c = 0; c < LAW_CHANNELS; c++) {
+        plate->next[c] = (double)drive[c];
+    }
 }
 
 static loaded_t assemble(const plate_t *plate, double position, double load)
@@ -101,9 +110,10 @@ static void runge_kutta(const loaded_t *l, double step, double state[4])
     }
 }
 
-void plate_advance(plate_t *plate, double period, double position, double load)
+void plate_advance(plate_t *plate, real_t position, real_t load)
 {
-    loaded_t l = assemble(plate, position, load);
+    double period = 1.0 / (double)design.rate;
+    loaded_t l = assemble(plate, (double)position, (double)load);
     for (int i = 0; i < SUBSTEPS; i++) {
         runge_kutta(&l, period / SUBSTEPS, plate->state);
     }

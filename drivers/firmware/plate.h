@@ -3,7 +3,7 @@
 #ifndef PLATE_H
 #define PLATE_H
 
-#include <stdint.h>
+#include "law.h"
 
 typedef struct {
     double mass, damping, stiffness;              /* kg, N s/m, N/m: of the finger, at the surface */
@@ -15,11 +15,14 @@ typedef struct {
 
 #define PLATE_DEFAULT {4e-3, 1.5, 300.0, 1e-6, 1u, {0.0, 0.0, 0.0, 0.0}, {0.0, 0.0}, {0.0, 0.0}}
 
-/* Read both sensors (m), with noise and resolution. */
-void plate_sense(plate_t *plate, double sensed[2]);
+/* Read the sensors (m), with noise and resolution; a screen has none. */
+void plate_sense(plate_t *plate, real_t sensed[LAW_SENSORS]);
 
-/* Advance by `period` (s) under the held drive and a finger at `position` (m from the middle, NaN: none) that presses
-   with `load` (N); then `next` acts. */
-void plate_advance(plate_t *plate, double period, double position, double load);
+/* Set the drive (A) that acts from the next step on. */
+void plate_drive(plate_t *plate, const real_t drive[LAW_CHANNELS]);
+
+/* Advance by a sample under the held drive and a finger at `position` (m from the middle, NaN: none) that presses with
+   `load` (N); then the drive that was set acts. */
+void plate_advance(plate_t *plate, real_t position, real_t load);
 
 #endif
