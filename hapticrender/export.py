@@ -26,7 +26,7 @@ CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
 BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "PAST": 16, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES = 12_528  # of the rest, with the textures' own
+OTHER_BYTES = 12_516  # of the rest, with the textures' own
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
@@ -128,9 +128,6 @@ def board_design(rendering: Rendering, bands: int = 0) -> tuple[dict[str, int], 
     measuring = min(MEASURING, lowest / 2, spacing(used) / (2 * math.pi))
     fields: dict[str, Any] = {
         "rate": float(model.rate),
-        "delay": int(law["delay"]),
-        "lookahead": controller.lookahead,
-        "most_bands": most,
         "bands_used": len(used),
         "spatial": int(law["spatial"]),
         "learns": int(law["learns"]),

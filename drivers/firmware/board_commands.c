@@ -64,11 +64,10 @@ static uint8_t commit(board_t *board, const frame *from)
 static uint8_t gain(board_t *board, const frame *from)
 {
     real_t value = (real_t)get_f32(from->payload);
-    if (!(value >= REAL(0.0) && value <= REAL(1.0))) {
+    if (law_set_gain(&board->law, value) == 0u) {
         return REASON_VALUE;
     }
     board->gain = value;
-    (void)law_set_gain(&board->law, value);
     return REASON_NONE;
 }
 
@@ -269,7 +268,7 @@ static uint8_t hello(board_t *board, const frame *from)
     at = put_f32(put_f32(at, (float)design.rate), (float)law_carrier(&design, design.drive_limit));
     at = put_f32(at, (float)design.sensor_limit);
     at = put_u32(at, hardware_cycle_rate);
-    at = put_u16(put_u16(at, (uint16_t)design.delay), BOARD_QUEUE);
+    at = put_u16(put_u16(at, LAW_DELAY), BOARD_QUEUE);
     at = put_u8(put_u8(at, LAW_CHANNELS), (uint8_t)BOARD_SENSED);
     at = put_u8(put_u8(at, LAW_BANDS), BOARD_LINES);
     at = put_u8(at, BOARD_SILENCE_MS + BOARD_FADE_MS);

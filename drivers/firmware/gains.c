@@ -198,10 +198,8 @@ static uint32_t note_innovations(gains_t *s, const gain_settings_t *p, const rea
 }
 
 gain_faults_t gains_check(
-    gains_t *gains, const gain_settings_t *used, const real_t sensed[], uint32_t invalid, const real_t force[2])
+    gains_t *s, const gain_settings_t *p, const real_t sensed[], uint32_t invalid, const real_t force[2])
 {
-    gains_t *s = gains;
-    const gain_settings_t *p = used;
     gain_faults_t faults = {0u, 0u, 0u};
     const uint32_t jump = note_innovations(s, p, sensed, invalid);
     if ((jump != 0u) && (s->left == 0u)) {
@@ -219,8 +217,6 @@ gain_faults_t gains_check(
     } else if (s->watched != 0u) {
         clear_sums(s, ACTUATOR);
         s->watched = 0u;
-    } else {
-        /* nothing happens */
     }
     correct_model(s->models[STATE], p, s->e, REAL(1.0));
     advance_model(s->models[STATE], p, force);

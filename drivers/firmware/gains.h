@@ -39,6 +39,6 @@ typedef struct {
 /* Compare a sample's sensors, but those that are invalid (bits), with the motion that device and force (N, N, from this
  * sample on) give. */
 gain_faults_t gains_check(
-    gains_t *gains, const gain_settings_t *used, const real_t sensed[], uint32_t invalid, const real_t force[2]);
+    gains_t *s, const gain_settings_t *p, const real_t sensed[], uint32_t invalid, const real_t force[2]);
 
 #endif

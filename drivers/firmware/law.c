@@ -309,8 +309,6 @@ static void scale_reference(law_t *law, real_t needed)
         law->hold_left = d->hold;
     } else if (expired != 0u) {
         law->peak *= d->decay;
-    } else {
-        /* held */
     }
     law->scale += d->scale_smoothing * (REAL(1.0) / real_max(law->peak, REAL(1.0)) - law->scale);
     law->smooth_scale += d->scale_smoothing * (law->scale - law->smooth_scale);
@@ -334,8 +332,6 @@ static real_t drive_of(law_t *law, uint32_t channel, const real_t force[2], real
         exact = REAL(0.0);
     } else if (d->drive_step > REAL(0.0)) {
         exact = shape_noise(law, exact, channel);
-    } else {
-        /* as it is */
     }
     return real_clip(exact, -law->drive_limit, law->drive_limit);
 }

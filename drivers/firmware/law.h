@@ -17,6 +17,7 @@
 #include "real.h"
 
 #define LAW_FILTER_TAPS 12  /* of the derivatives' filters, 6 of them ahead */
+/* LAW_DELAY: samples from a sensed one to the moment that its drive acts; `reference` of law_step is this far ahead: */
 #define LAW_LOOKAHEAD (LAW_DELAY + LAW_FILTER_TAPS / 2)
 #define LAW_BASIS 6         /* beta: r, r'/w_n, r''/w_n^2, r_p (r through the pair of poles), r_p'/w_p, D_00 r' T */
 #define LAW_RING (LAW_BASIS + 2) /* basis and deviation force of a sample, until they act */
@@ -50,9 +51,6 @@ typedef struct {
 /* Everything that `hapticrender export` derives from a scene; see hapticrender/control/inverse_records.py. */
 typedef struct {
     real_t rate;         /* Hz */
-    uint32_t delay;      /* samples from a sensed sample to the moment that the drive computed from it acts */
-    uint32_t lookahead;  /* samples by which `reference` of law_step is ahead */
-    uint32_t most_bands; /* LAW_BANDS */
     uint32_t bands_used; /* of `bands` */
     uint32_t spatial;    /* 1: the whole texture follows the finger, and fades in and out with contact */
     uint32_t learns;     /* 1: the sensors are used; 0: open loop */
@@ -157,7 +155,7 @@ typedef struct law {
 void law_init(law_t *law, const design_t *used);
 
 /*
- * Take up other bands: 1, or 0 with nothing changed where `count` > most_bands or a number is out of range (frequency
+ * Take up other bands: 1, or 0 with nothing changed where `count` > LAW_BANDS or a number is out of range (frequency
  * > 0.4 rate, wavenumber or frequency < 0, magnitude > sensor_limit, not finite).  A band whose carrier stays glides to
  * its amplitude within 20 ms; any other fades out within 20 ms, and its successor fades in as at a start (50 ms).
  */
@@ -176,7 +174,7 @@ uint32_t law_set_drive_limit(law_t *law, real_t limit);
  */
 uint32_t law_step(law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[]);
 
-/* Target and measured envelope (re, im; m) of a band < most_bands as of the last sample, at its carrier. */
+/* Target and measured envelope (re, im; m) of a band < LAW_BANDS as of the last sample, at its carrier. */
 void law_target(const law_t *law, uint32_t band, real_t envelope[2]);
 void law_measured(const law_t *law, uint32_t band, real_t envelope[2]);
 

@@ -291,8 +291,6 @@ uint32_t learning_follow_contact(law_t *law)
         learning_reset(law, LAW_INITIAL, LAW_PARAMETERS);
     } else if ((v->since > d->initial_end) && ((law->sample % d->report_delay) == 0u)) {
         note_device(v);
-    } else {
-        /* nothing has changed */
     }
     return (v->since >= d->learning_delay) ? 1u : 0u;
 }

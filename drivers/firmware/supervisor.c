@@ -72,8 +72,6 @@ static supervisor_cause_t cause_of(
     } else if (frozen != 0u) {
         cause = SUPERVISOR_FROZEN;
         sensors = frozen;
-    } else {
-        /* every sensor is fine */
     }
     s->beyond_count = (beyond != 0u) ? (s->beyond_count + s->p->beyond_time) : less_one(s->beyond_count);
     if ((beyond != 0u) && (s->beyond_count > 2u * s->p->beyond_time)) {
@@ -104,8 +102,6 @@ static supervisor_cause_t check_sensors(supervisor_t *s, const real_t sensed[], 
             lost |= isfinite(sensed[i]) ? 0u : 1u;
         } else if (is_frozen(s, i, sensed[i], drive) != 0u) {
             frozen |= 1u << i;
-        } else {
-            /* it moves */
         }
         if ((size < d->sensor_limit) && (size > s->sensed_bound)) {
             beyond |= 1u << i;
