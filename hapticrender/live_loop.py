@@ -20,13 +20,7 @@ from hapticrender.control.supervisor import FADE_OUT, SupervisedController, desi
 from hapticrender.driver_checks import check_sensed
 from hapticrender.errors import HapticError, WatchdogTimeout
 from hapticrender.inferred import ContactLag
-from hapticrender.loop import (
-    RECENT,
-    device_fault,
-    motion_of,
-    motion_source,
-    stops_itself,
-)
+from hapticrender.loop import RECENT, device_fault, motion_of, motion_source, stops_itself
 from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Array, Controller, Flag, Rendering, Sensed
 from hapticrender.realtime_entry import RealtimeEntry

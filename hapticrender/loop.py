@@ -351,18 +351,17 @@ class _Loop:
         if not self._played:
             return {"flags": np.zeros(0, int)}
         played, self._played = self._played, []
-        names = [name for name in played[0] if name != "motion"]
-        signals = {name: np.concatenate([each[name] for each in played]) for name in names}
-        motion = [each["motion"] for each in played if "motion" in each]
-        if motion:  # the first of it holds for what was played before
-            missing = len(signals["flags"]) - sum(map(len, motion))
-            signals["motion"] = np.concatenate([np.repeat(motion[0][:1], missing, axis=0), *motion])
+        signals = _joined(played)
         flags = signals["flags"]
         if self._stopped >= 0:
             flags = flags[: max(self._stopped + 1 - self._first, 0)]
         self._recent = np.append(self._recent, flags)[-round(RECENT * self.rendering.driver.rate) :]
         signals["flags"] = self._touches.update(signals)
-        return self._due({name: signal[: self._count] for name, signal in signals.items()})
+        signals = _joined([self._held, {name: signal[: self._count] for name, signal in signals.items()}])
+        found = self._moved(signals)
+        count = len(found["motion"])
+        self._held = {name: signal[count:] for name, signal in signals.items()}
+        return {name: signal[:count] for name, signal in signals.items()} | found
 
     def rest(self) -> dict[str, Any]:
         """Signals of the samples that are held back for their motion, at the end: as if they went on as they came."""
@@ -437,23 +436,20 @@ class _Loop:
     def _time(self, count: int) -> Array:
         return (self._start + np.arange(count)) / self.rendering.driver.rate
 
-    def _due(self, signals: dict[str, Array]) -> dict[str, Any]:
-        """Signals of all samples whose motion is known, with it and its source."""
-        held = self._held
-        if len(held["flags"]):
-            if "motion" in signals:  # the first of it holds for what was held back before
-                held.setdefault("motion", np.repeat(signals["motion"][:1], len(held["flags"]), axis=0))
-            signals = {name: np.concatenate([held[name], signal]) for name, signal in signals.items()}
-        found = self._moved(signals)
-        count = len(found["motion"])
-        self._held = {name: signal[count:] for name, signal in signals.items()}
-        return {name: signal[:count] for name, signal in signals.items()} | found
-
     def _moved(self, signals: dict[str, Array]) -> dict[str, Any]:
         """Motion of the samples for which it is known, and its source."""
         driver, model = self.rendering.driver, self.rendering.model
         motion = motion_of(driver, model, signals, self._contact)
         return {"motion": motion, "motion_source": motion_source(driver, model, "motion" in signals)}
+
+
+def _joined(blocks: list[dict[str, Array]]) -> dict[str, Array]:
+    """Signals of blocks that follow each other; the first motion that is stated holds for what was played before."""
+    signals = {name: np.concatenate([each[name] for each in blocks if name in each]) for name in blocks[-1]}
+    if "motion" in signals:
+        missing = len(signals["flags"]) - len(signals["motion"])
+        signals["motion"] = np.pad(signals["motion"], [(missing, 0), (0, 0)], "edge")
+    return signals
 
 
 def differences(rendering: Rendering, controller: object) -> tuple[str, ...]:

@@ -191,11 +191,7 @@ class RealtimeEntry(Addressed):
         """Numbers of the record at rest."""
         log, rate = self._arrays["log"], self.rate
         return {
-            **{
-                "block": self.controller.block,
-                "sensors": self.controller.sensors,
-                "channels": self.controller.channels,
-            },
+            **{name: getattr(self.controller, name) for name in ("block", "sensors", "channels")},
             **{"middle": 1, "slot": 2, "stopped": -1, "gain": 1.0, "open": 1.0, "place": np.nan, "rate": rate},
             **{"ahead": self.ahead, "log_rows": log.shape[0], "log_width": log.shape[1]},
             "age": round(HOLD * rate),
