@@ -118,7 +118,7 @@ QUEUE_FUNCTION = CFunction(_queue, CALLBACK)
 
 
 class Relay:
-    """What `relay` reads and writes: channels, the function that it calls, and counts.
+    """What `_relay` reads and writes: channels, the function that it calls, and counts.
 
     `inputs` and `outputs` are columns of the stream that are used, from 0 on, in the order of sensors and drive
     channels; `block` is in samples.
