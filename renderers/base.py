@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -35,6 +35,13 @@ def check_limits(limits: Limits, drive: float, unit: str, sensed: float = math.i
             raise ValueError(f"[limits] {name} = {stated:g} {of}: {bound}")
 
 
+@dataclass(frozen=True, kw_only=True)
+class Settings(checks.Validated):
+    """Settings of a renderer, in a scene's [render] table; `probe`: the device is probed before the loop closes."""
+
+    probe: bool = checks.checked(checks.flag, True)
+
+
 class BaseRenderer:
     """Renderer made of parts: `read` the scene once, then give its setup to every other part.
 
@@ -44,6 +51,7 @@ class BaseRenderer:
     name = ""
     needs = "a driver"  # of a real device of this kind, in a few words
     differentiated = False  # the target is the time derivative of `waveform`
+    no_board = "no board has a law for it: play it from the host (--driver)"  # why `board_law` refuses, and what to do
 
     def open(self, scene: Scene, driver: Driver | None = None) -> Rendering:
         """Open a scene on the device behind `driver`, or on the simulated one; see ``protocols.Renderer``."""
@@ -139,7 +147,7 @@ class BaseRenderer:
 
     def board_law(self, setup: Setup) -> str:
         """Return the law of ``drivers/firmware`` that plays the scene, "plate" or "screen"; a ValueError: none does."""
-        raise ValueError(f"device.kind = {self.name!r}: no board has a law for it: play it from the host (--driver)")
+        raise ValueError(f"device.kind = {self.name!r}: {self.no_board}")
 
     def waveform(self, setup: Setup, texture: Texture) -> Waveform:
         """Return the target waveform of `texture` over time (s) and position (m), in the device's quantity."""
@@ -155,35 +163,35 @@ class BaseRenderer:
         return supervised(controller, model, feedback=feedback)
 
 
-def check_tables(
-    scene: Scene, device: Collection[str], settings: Collection[str] = (), level: Collection[str] = ()
-) -> None:
-    """Refuse a key that stands in the wrong table of a scene, or in none.
+def read_tables(
+    scene: Scene,
+    device: type[checks.Validated],
+    settings: type[Settings],
+    level: Collection[str],
+    more: Collection[str] = (),
+) -> tuple[Any, Any, Any]:
+    """Settings of a renderer, and the parameters of its device as assumed by the controller and as simulated.
 
-    `device` names all parameters of the device, those of its model `level` (of the simulation only) included;
-    `settings` those of the renderer.
+    Refuses a key that stands in the wrong table of a scene, or in none.  Parameters of the model `level` stand in
+    [simulation] and hold for both devices; `more` are those that only some of the devices have.
     """
-    simulated = set(device) - {"rate"}
-    tables: dict[str, tuple[Mapping[str, Any], Collection[str]]] = {
-        "device": (scene.profile, set(device) - set(level)),
-        "simulation": (scene.simulation, simulated),
-        "render": (scene.rendering, set(settings)),
+    names = {*device.names(), *more}
+    tables: dict[str, tuple[Mapping[str, Any], set[str]]] = {
+        "device": (scene.profile, names - set(level)),
+        "simulation": (scene.simulation, names - {"rate"}),
+        "render": (scene.rendering, settings.names()),
     }
     for table, (values, known) in tables.items():
         for key in values:
-            others = " or ".join(f"[{name}]" for name, (_, names) in tables.items() if key in names)
+            others = " or ".join(f"[{name}]" for name, (_, keys) in tables.items() if key in keys)
             if key not in known and others:
                 raise ValueError(f"{table}.{key}: belongs in {others}")
         with checks.inside(table):
             checks.check_names(values, known, scene_keys(table))
-
-
-def read_devices(scene: Scene, kind: type[checks.Validated], level: Collection[str] = ()) -> tuple[Any, Any]:
-    """Parameters of the device as assumed by the controller (profile), and as simulated; both at one model level."""
-    common = {key: value for key, value in scene.simulation.items() if key in level}
+    with checks.inside("render"):
+        chosen = settings.with_overrides(scene.rendering)
     with checks.inside("device"):
-        assumed = kind.with_overrides({**common, **scene.profile})
-    if not scene.simulation:
-        return assumed, assumed
+        common = {key: value for key, value in scene.simulation.items() if key in level}
+        assumed = device.with_overrides({**common, **scene.profile})
     with checks.inside("simulation"):
-        return assumed, kind.with_overrides({**scene.profile, **scene.simulation})
+        return chosen, assumed, device.with_overrides({**scene.profile, **scene.simulation})

@@ -9,12 +9,12 @@ from voltage and current, or nothing.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from hapticrender.checks import inside, option, parameter, require
+from hapticrender.checks import option, parameter, require
 from hapticrender.control.device_model import DeviceModel
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters, ElectroadhesionScreen, SquareRoot
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import check_tables, read_devices
+from hapticrender.renderers.base import read_tables
 from hapticrender.renderers.friction import HEADROOM, FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene
@@ -85,10 +85,7 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
     def read(self, scene: Scene, driver: Driver | None) -> ScreenSetup:
         """Read the tables of a scene; refuses one that needs more attraction than the source can make."""
-        check_tables(scene, ElectroadhesionParameters.names(), ElectroadhesionSettings.names(), LEVEL)
-        with inside("render"):
-            settings = ElectroadhesionSettings(**scene.rendering)
-        setup = ScreenSetup(scene, settings, *read_devices(scene, ElectroadhesionParameters, LEVEL))
+        setup = ScreenSetup(scene, *read_tables(scene, ElectroadhesionParameters, ElectroadhesionSettings, LEVEL))
         assumed, current = setup.assumed, setup.assumed.drive_kind == "current"
         source = (assumed.current_limit, "A") if current else (assumed.voltage_limit, "V")
         carrier_limit(scene.device_profile.limits, *source)  # refuses what no finger's load could make right

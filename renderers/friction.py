@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from hapticrender.bands import Bands
-from hapticrender.checks import Validated, checked, flag, option, parameter, require
+from hapticrender.checks import option, parameter, require
 from hapticrender.control.device_model import DeviceModel, FingerRange
 from hapticrender.plants.sliding_contact import SlidingParameters
 from hapticrender.protocols import Array, Driver, Texture
-from hapticrender.renderers.base import BaseRenderer, Waveform, check_limits
+from hapticrender.renderers.base import BaseRenderer, Settings, Waveform, check_limits
 from hapticrender.renderers.limits import Need, check_carriers, examined, needed, perceptible, speeds, top_speed
 from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.perception import VELOCITY_PER_FORCE
@@ -28,18 +28,17 @@ PLACES = ("friction",)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrictionSettings(Validated):
+class FrictionSettings(Settings):
     """Conversion of a texture to friction; set in a scene's [render] table.
 
     `velocity_per_force` is the skin velocity matched to a newton of friction; 0: the finger's own |V_s/F|, for fixed
     carriers.  `square_root` says whether a screen's drive is an attraction (N), or the current's envelope itself.
-    `probe` says whether a vibrating surface, or the plate of a hybrid, is probed before the loop closes; of a surface
-    the gain of drive and sensor is corrected.
+    `probe` says whether a vibrating surface, or the plate of a hybrid, is probed; of a surface the gain of drive and
+    sensor is corrected.
     """
 
     velocity_per_force: float = parameter(VELOCITY_PER_FORCE, "m/(N s)", most=100.0)
     square_root: str = option("on", "on", "off")
-    probe: bool = checked(flag, True)
 
 
 @dataclass(frozen=True)

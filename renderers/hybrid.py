@@ -108,6 +108,10 @@ class HybridRenderer(BaseRenderer):
     name = "hybrid"
     needs = "2 coils (A), 2 displacement sensors (m), a current source on a carrier (A peak), a tribometer (N)"
     differentiated = True
+    no_board = (
+        "no board plays it: it takes two laws, of coils and screen, and a board has one: play it from the host "
+        "(--driver 'audio:NAME?channels=1,2,3'), or its plate alone, with kind = 'vt-plate'"
+    )
 
     def __init__(self) -> None:
         self._plate, self._screen = VibrotactileRenderer(), ElectroadhesionRenderer()
@@ -154,14 +158,6 @@ class HybridRenderer(BaseRenderer):
     def probe(self, setup: HybridSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes its plate, unless the scene says no."""
         return self._plate.probe(setup.plate, model, _part_of(driver, COILS, SENSORS, "plate"))
-
-    def board_law(self, setup: HybridSetup) -> str:
-        """Refuse boards."""
-        why = "no board plays it: it takes two laws, of coils and screen, and a board has one"
-        cure = (
-            "play it from the host (--driver 'audio:NAME?channels=1,2,3'), or its plate alone, with kind = 'vt-plate'"
-        )
-        raise ValueError(f"device.kind = {self.name!r}: {why}: {cure}")
 
     def shape(self, setup: HybridSetup) -> Any:
         """Return the square root for the screen's share of the scene."""

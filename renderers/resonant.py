@@ -122,12 +122,8 @@ class ResonantDriver(WrappedDriver):
 
     def play(self, drive: Array) -> Sensed:
         """Play a block of friction (N); sample i of what is sensed was there at the start of interval i."""
-        rows, io, played = (
-            finger_inputs(self.finger, self._samples, self.block, self.rate),
-            self.signals,
-            list[Sensed](),
-        )
-        io["finger"][:] = rows[:, [LOAD, SPEED]]
+        io, played = self.signals, list[Sensed]()
+        io["finger"][:] = finger_inputs(self.finger, self._samples, self.block, self.rate)[:, [LOAD, SPEED]]
         if not math.isnan(self._load):
             io["finger"][:, 0] = self._load
         self._samples += self.block

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from hapticrender.bands import Bands
-from hapticrender.checks import inside, require
+from hapticrender.checks import require
 from hapticrender.control.device_model import Demand, DeviceModel
 from hapticrender.plants.friction_laws import LAWS
 from hapticrender.plants.ultrasonic import UltrasonicParameters
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters, UltrasonicSurface
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import check_tables, read_devices
+from hapticrender.renderers.base import read_tables
 from hapticrender.renderers.friction import FrictionRenderer, FrictionSettings, FrictionSetup, carrier_limit
 from hapticrender.renderers.resonant import ResonantDriver, amplitude_loop
 from hapticrender.renderers.shaped import Port
@@ -45,15 +45,16 @@ class UltrasonicRenderer(FrictionRenderer):
 
     name = "ultrasonic"
     needs = "a drive at the carrier's rate (V), the vibration sensed (m), or open loop"
+    no_board = (
+        "no board plays it: its drive is computed at the carrier's rate, 192 kHz or more: "
+        "play it from the host, such as by --driver 'audio:NAME?rate=192000'"
+    )
 
     def read(self, scene: Scene, driver: Driver | None) -> SurfaceSetup:
         """Read the tables of a scene."""
         law = LAWS.get(str({**scene.profile, **scene.simulation}.get("law")), LAWS["fit"])
-        names = SurfaceParameters.names() | UltrasonicParameters.names() | law.names()
-        check_tables(scene, names, FrictionSettings.names(), LEVEL)
-        with inside("render"):
-            settings = FrictionSettings(**scene.rendering)
-        assumed, simulated = read_devices(scene, SurfaceParameters, LEVEL)
+        more = UltrasonicParameters.names() | law.names()
+        settings, assumed, simulated = read_tables(scene, SurfaceParameters, FrictionSettings, LEVEL, more)
         limit = carrier_limit(scene.device_profile.limits, assumed.mode.drive_limit, "V")
         assumed = replace(assumed, mode=replace(assumed.mode, drive_limit=limit))
         return SurfaceSetup(scene, settings, assumed, simulated)
@@ -71,12 +72,6 @@ class UltrasonicRenderer(FrictionRenderer):
         """Return what probes the response on the resonance of a surface that senses, unless the scene says no."""
         probed = isinstance(driver, ResonantDriver) and driver.sensed_channels
         return driver.calibrate if setup.settings.probe and probed else None
-
-    def board_law(self, setup: SurfaceSetup) -> str:
-        """Refuse boards."""
-        why = "no board plays it: its drive is computed at the carrier's rate, 192 kHz or more"
-        cure = "play it from the host, such as by --driver 'audio:NAME?rate=192000'"
-        raise ValueError(f"device.kind = {self.name!r}: {why}: {cure}")
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""

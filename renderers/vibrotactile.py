@@ -17,7 +17,7 @@ from hapticrender.control.supervisor import governed
 from hapticrender.driver_checks import check_channels
 from hapticrender.plants.plate import EXPECTED_BENDING, Plate, PlateParameters
 from hapticrender.protocols import Driver
-from hapticrender.renderers.base import BaseRenderer, check_limits, check_tables, read_devices
+from hapticrender.renderers.base import BaseRenderer, Settings, check_limits, read_tables
 from hapticrender.renderers.limits import check_carriers, check_path, check_targets, demand, perceptible
 from hapticrender.touch.scene import Scene
 
@@ -27,12 +27,12 @@ LEVEL = ("degrees_of_freedom", "finger_dynamics")  # how finely a plate is model
 
 @dataclass(frozen=True)
 class PlateSetup:
-    """A scene, the plate that its controller assumes, and the plate that is simulated."""
+    """A scene, its settings, the plate that its controller assumes, and the plate that is simulated."""
 
     scene: Scene
+    settings: Settings
     assumed: PlateParameters
     simulated: PlateParameters
-    probe: bool = True  # whether a device is probed before the loop closes
 
 
 class VibrotactileRenderer(BaseRenderer):
@@ -43,10 +43,7 @@ class VibrotactileRenderer(BaseRenderer):
 
     def read(self, scene: Scene, driver: Driver | None) -> PlateSetup:
         """Read the tables of a scene."""
-        check_tables(scene, PlateParameters.names(), ("probe",), level=LEVEL)
-        probe = scene.rendering.get("probe", True)
-        require(isinstance(probe, bool), "render.probe", probe, "true or false", TypeError)
-        setup = PlateSetup(scene, *read_devices(scene, PlateParameters, LEVEL), probe)
+        setup = PlateSetup(scene, *read_tables(scene, PlateParameters, Settings, LEVEL))
         check_limits(scene.device_profile.limits, setup.assumed.current_limit, "A", setup.assumed.sensor_range / 2)
         return setup
 
@@ -60,7 +57,7 @@ class VibrotactileRenderer(BaseRenderer):
     def probe(self, setup: PlateSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes the wiring of two coils and two sensors, unless the scene says no."""
         whole = setup.assumed.coils == driver.sensed_channels == 2
-        return partial(probe_plate, model=model) if setup.probe and whole else None
+        return partial(probe_plate, model=model) if setup.settings.probe and whole else None
 
     def board_law(self, setup: PlateSetup) -> str:
         """Return the law of boards that plays it."""
