@@ -226,14 +226,12 @@ def _read_csv(path: Path) -> tuple[Header, Array]:
         comment, _, first = (file.readline() for _ in range(3))
         if not comment.startswith("# "):
             raise ValueError("the first line is no comment with a header")
+        header = Header.from_json(comment[2:], str(path))
+        columns = 1 + len(header.channels)
         lines = itertools.chain([first], file)
-        numbers = np.loadtxt(lines, delimiter=",", ndmin=2) if first else None
-    header = Header.from_json(comment[2:], str(path))
-    columns = len(header.channels)
-    if numbers is None:
-        return header, np.empty((0, columns))
-    if numbers.shape[1] != 1 + columns:
-        raise ValueError(f"{path}: {numbers.shape[1]} columns, expected {1 + columns}")
+        numbers = np.loadtxt(lines, delimiter=",", ndmin=2) if first else np.empty((0, columns))
+    if numbers.shape[1] != columns:
+        raise ValueError(f"{path}: {numbers.shape[1]} columns, expected {columns}")
     return header, numbers[:, 1:]
 
 

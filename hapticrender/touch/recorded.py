@@ -185,8 +185,6 @@ def _read_sound(file: str, channel: int) -> tuple[Array, float]:
         for bad in np.flatnonzero(~(np.abs(values) <= LOUDEST))[:1]:  # NaN included
             bound = f"must be a finite number within {LOUDEST:g} times full scale"
             raise ValueError(f"sample {bad} of channel {channel} = {values[bad]}: {bound}")
-        if values.size < 2:
-            raise ValueError(f"has {values.size} readable samples: must be >= 2 samples")
         return values, 1 / rate
 
 
