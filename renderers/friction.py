@@ -114,10 +114,9 @@ class FrictionSetup:
         """Refuse a skin velocity that the finger's own speed makes impossible, where the skin is modelled."""
         if self.scene.finger.mechanics.order == 0:
             return
-        need = needed(self.scene, model, bands, self.waveform_of(self.scene.texture))
         locked = bool((bands.wavenumber > 0.0).any())
         speed = top_speed(self.scene) if locked else self.speed
-        velocity = need.amplitude * self.settings.velocity_per_force
+        velocity = self.needed(model).amplitude * self.settings.velocity_per_force
         if velocity > speed * (1 + 1e-9):  # up to rounding
             bound = f"must be <= {speed:.3g} m/s, the {'top' if locked else 'median'} speed of the finger"
             raise ValueError(f"texture.amplitude asks for a skin velocity of {velocity:.3g} m/s: {bound}")

@@ -24,13 +24,13 @@ LOOK_AHEAD = 30.0  # s of a scene that are examined for the finger's speed and t
 FASTEST = 10.0  # m/s: no finger is faster
 
 
-def check_path(scene: Scene, half: float, surface: str) -> None:
-    """Refuse a finger that leaves a surface of half length `half` (m)."""
+def check_path(scene: Scene, half: float) -> None:
+    """Refuse a finger that leaves a glass of half length `half` (m)."""
     duration = min(scene.duration, 3600.0)
     position = scene.finger.position(np.arange(0.0, duration, max(CHECK_STEP, duration / 1e6)))
     reach = np.nanmax(abs(position), initial=0.0)
     if reach > half:
-        raise ValueError(f"finger.position reaches {reach:g} m: must stay within {half:g} m of the {surface}'s middle")
+        raise ValueError(f"finger.position reaches {reach:g} m: must stay within {half:g} m of the glass's middle")
 
 
 def examined(scene: Scene) -> Array:

@@ -51,7 +51,7 @@ class VibrotactileRenderer(BaseRenderer):
         """Return the simulated plate with the scene's finger on it."""
         coils, assumed = setup.simulated.coils, setup.assumed.coils
         require(coils == assumed, "simulation.coils", coils, f"{assumed}, as in [device]")
-        check_path(setup.scene, setup.simulated.glass_length / 2, "glass")
+        check_path(setup.scene, setup.simulated.glass_length / 2)
         return Plate(setup.simulated, setup.scene.finger, seed)
 
     def probe(self, setup: PlateSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:

@@ -57,13 +57,12 @@ class Path(NamedTuple):
     position: Callable[[Array], Array]
 
 
-def sliding(time: Array, speed: float = 0.1) -> Array:
-    """Positions of a finger at `speed` (m/s), to and fro over +-25 mm, turning within 50 ms (4 m/s2 at 100 mm/s).
+def sliding(time: Array) -> Array:
+    """Positions of a finger at 0.1 m/s, to and fro over +-25 mm, turning within 50 ms (4 m/s2).
 
     Turned at once, the finger's load alone shakes the plate by 1.4 % of 5 um rms, whatever is played.
     """
-    half = 0.05 / speed  # s, from turn to turn
-    turn = np.round(time / half)
-    since = np.abs(time - half * turn)
-    away = speed * np.where(since < 0.025, since**2 / 0.05 + 0.0125, since)
+    turn = np.round(2.0 * time)
+    since = np.abs(time - 0.5 * turn)
+    away = 0.1 * np.where(since < 0.025, since**2 / 0.05 + 0.0125, since)
     return np.asarray((-1.0) ** turn * (0.025 - away))

@@ -78,7 +78,7 @@ def analyse_finger(
     course = _course(recording, profile)
     block = recording.header.block or 1 if block is None else block
     late = course.plate.delay - block
-    _check(recording, course.plate, late)
+    _check(recording, course.plate, block)
     rate = recording.rate
     drive, sensed = (np.apply_along_axis(hold_last, 0, each) for each in (recording.drive, recording.sensed))
     if free_start:
@@ -130,7 +130,7 @@ def _course(recording: Recording, profile: DeviceProfile | PlateParameters | str
     return Course.of(PlateParameters.with_overrides(stated), profile.uncertainty, duration)
 
 
-def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
+def _check(recording: Recording, plate: PlateParameters, block: int) -> None:
     header = recording.header
     if header.sensed_channels != 2 or header.unit != "m":
         found = f"{header.sensed_channels} sensors in {header.unit}"
@@ -139,7 +139,6 @@ def _check(recording: Recording, plate: PlateParameters, late: int) -> None:
         raise ValueError(f"{header.name}: {header.drive_channels} drive channels: must be {plate.coils}, one a coil")
     if len(recording) < recording.rate:
         raise ValueError(f"{header.name}: {len(recording) / recording.rate:g} s long: must be >= 1 s")
-    block = plate.delay - late
     cure = "state delay, from a sensed sample to the drive computed from it, in [device] of the profile"
     if not (isinstance(block, int | np.integer) and 1 <= block <= plate.delay):
         raise ValueError(f"{block=} samples: must be an integer from 1 to the plate's delay, {plate.delay}: {cure}")
