@@ -177,7 +177,7 @@ class AudioDriver(BaseDriver):
         present, own = (card.outputs, card.output_latency) if output else (card.inputs, card.input_latency)
         if max(channels) > present:
             raise DeviceNotFound(f"{self}: {kind} {channels}: {card} has {present} {kind}")
-        latency = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
+        latency: Any = self.latency if isinstance(self.latency, str | int | float) else self.latency[output]
         seconds = {"low": own[0], "high": own[1]}.get(latency, latency)
         return card.index, max(channels), float(seconds)
 

@@ -6,6 +6,8 @@ and so do these while there is no function.  It is that of a ``RealtimeEntry``, 
 blocks with Python.
 """
 
+from typing import Any
+
 import numba
 import numpy as np
 from numba import carray, types
@@ -164,7 +166,7 @@ class BlockQueue:
         self._drive = np.zeros((SLOTS, block, channels), np.float32)
         self._numbers = np.full(SLOTS, -1, np.int64)
         self._flags = np.zeros(SLOTS, np.int64)
-        arrays = {"sensed_at": self._sensed, "drive_at": self._drive}
+        arrays: dict[str, Any] = {"sensed_at": self._sensed, "drive_at": self._drive}
         arrays |= {"number_at": self._numbers, "flags_at": self._flags}
         self._record = record_of(QUEUE, first=ahead, sensors=sensors, channels=channels, **arrays)
         self.address, self.user_data = QUEUE_FUNCTION.address, int(self._record.ctypes.data)  # as of a callback

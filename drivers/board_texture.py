@@ -168,7 +168,7 @@ class BoardTexture:
             truth = parts.along_surface(places[1:-2] + x * step)
             inner = (1 + x) * (2 - x) / 2 * ((1 - x) * table[1:-2] + x * table[2:-1])
             off = inner - x * (1 - x) / 6 * ((2 - x) * table[:-3] + (1 + x) * table[3:]) - truth
-            error = float(np.linalg.norm(off) / max(np.linalg.norm(truth), 1e-30))
+            error = float(np.linalg.norm(off)) / max(float(np.linalg.norm(truth)), 1e-30)
             if error <= FINE or 2 * points > most:
                 break
             points *= 2

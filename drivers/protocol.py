@@ -283,7 +283,7 @@ def telemetry(payload: bytes) -> Telemetry:
     fields, rest = _fields(Kind.TELEMETRY, payload, BAND.size)
     state, cause, flags = State(fields[4]), Cause(fields[5]), Flag(fields[6])
     bands = (BandTelemetry(complex(*each[:2]), complex(*each[2:])) for each in BAND.iter_unpack(rest))
-    return Telemetry(*fields[:4], state, cause, flags, *fields[7:], tuple(bands))
+    return Telemetry._make([*fields[:4], state, cause, flags, *fields[7:], tuple(bands)])
 
 
 def stream(payload: bytes, drive_channels: int, sensed_channels: int) -> Stream:

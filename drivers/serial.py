@@ -59,6 +59,7 @@ class SerialDriver(BaseDriver):
             raise TypeError(f"option {name!r} of SerialDriver: must be one of finger, {', '.join(known)}")
         self.client = BoardClient(port, **options)
         self.finger, self._begun, self._last = finger, False, np.full(1, np.nan)
+        self._state: str
         self._started = math.inf  # s, of the client's clock
         self.rendering: Rendering | None = None  # set by `prepare`
         with self.client as client:

@@ -212,4 +212,5 @@ class FrictionRenderer(BaseRenderer):
         direct = model.sensor_delay == model.contact_length == 0.0
         if direct or bands.envelope is None or (bands.wavenumber > 0.0).any():
             return bands
-        return replace(bands, sensor_response=setup.assumed.sensor_response(bands.frequency, setup.speed))
+        device: Any = setup.assumed
+        return replace(bands, sensor_response=device.sensor_response(bands.frequency, setup.speed))

@@ -228,7 +228,8 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     own, of_screen = HybridSettings.names(), ElectroadhesionSettings.names()
     with inside("render"):
         check_names(scene.rendering, own | of_screen, scene_keys("render"))
-        settings = HybridSettings(**{key: value for key, value in scene.rendering.items() if key in own})
+        chosen: dict[str, Any] = {key: value for key, value in scene.rendering.items() if key in own}
+        settings = HybridSettings(**chosen)
     rendering = {key: value for key, value in scene.rendering.items() if key not in own}
     plate: dict[str, Any] = {"rendering": {key: value for key, value in rendering.items() if key == "probe"}}
     screen: dict[str, Any] = {"rendering": rendering, "limits": {}}  # which are the plate's

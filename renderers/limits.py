@@ -146,9 +146,9 @@ def needed(
         top = max(0.0 if bands.differentiated else top, min(model.highest_frequency, 0.4 * model.rate))
         return _need_of_waveform(scene, model, bands, waveform, per_target, top)
     sweep = np.minimum(top_speed(scene) * bands.wavenumber, model.highest_edge * model.highest_frequency)
-    top = bands.frequency + sweep
-    low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, top), top)
-    passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (top - low)
+    high = bands.frequency + sweep
+    low = np.where(bands.wavenumber > 0.0, np.minimum(model.lowest_frequency, high), high)
+    passed = low + np.linspace(0.0, 1.0, 400)[:, None] * (high - low)
     target = abs(bands.envelope) * (2 * np.pi * passed if bands.differentiated else np.ones_like(passed))
     drive = target * abs(per_target(passed))
     worst = int(drive.max(axis=0).argmax())
@@ -157,7 +157,7 @@ def needed(
     ends = float(passed.min()), float(passed.max())
     power = (drive[0, bands.wavenumber == 0.0] ** 2).sum() / 2.0
     rms = math.sqrt(power * -math.expm1(-scene.duration / scene.device_profile.limits.rms_time))
-    return Need(*sums, float(target[at]), float(passed[at]), *ends, rms)
+    return Need._make([*sums, float(target[at]), float(passed[at]), *ends, rms])
 
 
 def _need_of_waveform(
@@ -185,7 +185,8 @@ def _need_of_waveform(
     amplitude = float(abs(target).max())
     energy = np.cumsum(abs(spectrum) ** 2)
     ends = (float(frequency[np.searchsorted(energy, share * energy[-1])]) for share in (1e-3, 1.0 - 1e-3))
-    return Need(amplitude, float(abs(drive).max()), amplitude, float(frequency[abs(spectrum).argmax()]), *ends, rms)
+    strongest = float(frequency[abs(spectrum).argmax()])
+    return Need._make([amplitude, float(abs(drive).max()), amplitude, strongest, *ends, rms])
 
 
 def _faded(target: Array, rate: float) -> Array:

@@ -142,7 +142,9 @@ class ResonantDriver(WrappedDriver):
     def _sensed(self, friction: Array, played: list[Sensed], flags: Array) -> Sensed:
         """Measurements of the finger and flags, once a sample of friction; the mode's motion is left out."""
         columns = zip(*played, strict=True)
-        whole = Sensed(*(None if any(part is None for part in parts) else np.concatenate(parts) for parts in columns))
+        whole = Sensed._make(
+            None if any(part is None for part in parts) else np.concatenate(parts) for parts in columns
+        )
         device = thinned(whole, self.hold)
         flags = flags.copy() if device.flags is None else flags | device.flags
         return device._replace(sensed=friction, motion=None, flags=flags)
@@ -177,4 +179,5 @@ def amplitude_loop(parameters: SurfaceParameters, *, held: float | None = None, 
     if held is not None:
         stiffness = mode.mass * (2 * np.pi * float(mode.resonance(held))) ** 2
         model = replace(model, damping=np.array([[float(mode.damping(held))]]), stiffness=np.array([[stiffness]]))
-    return method_named(defaults.METHOD).design(model, parameters.amplitude_bands(), feedback=held is None)
+    method: Any = method_named(defaults.METHOD)
+    return method.design(model, parameters.amplitude_bands(), feedback=held is None)  # type: ignore[no-any-return]

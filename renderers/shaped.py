@@ -83,7 +83,7 @@ class WrappedDriver:
 
 def thinned(sensed: Sensed, hold: int) -> Sensed:
     """Measurements once in `hold` samples; flags of all of them."""
-    first = Sensed(*(None if column is None else column[::hold] for column in sensed))
+    first = Sensed._make(None if column is None else column[::hold] for column in sensed)
     if sensed.flags is None:
         return first
     return first._replace(flags=np.bitwise_or.reduce(np.reshape(sensed.flags, (-1, hold)), axis=1))

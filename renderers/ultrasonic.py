@@ -70,8 +70,9 @@ class UltrasonicRenderer(FrictionRenderer):
 
     def probe(self, setup: SurfaceSetup, model: DeviceModel, driver: Driver) -> Callable[[Driver], None] | None:
         """Return what probes the response on the resonance of a surface that senses, unless the scene says no."""
-        probed = isinstance(driver, ResonantDriver) and driver.sensed_channels
-        return driver.calibrate if setup.settings.probe and probed else None
+        if setup.settings.probe and isinstance(driver, ResonantDriver) and driver.sensed_channels:
+            return driver.calibrate
+        return None
 
     def device_model(self, setup: SurfaceSetup, driver: Driver) -> DeviceModel:
         """Return the device model of the surface behind `driver`; refuses what the law or the drive cannot do."""

@@ -77,9 +77,8 @@ def analyse_finger(
     require(isinstance(recording, Recording), "recording", recording, "a Recording: see Recording.load", TypeError)
     course = _course(recording, profile)
     block = recording.header.block or 1 if block is None else block
-    late = course.plate.delay - block
     _check(recording, course.plate, block)
-    rate = recording.rate
+    rate, late = recording.rate, course.plate.delay - block
     drive, sensed = (np.apply_along_axis(hold_last, 0, each) for each in (recording.drive, recording.sensed))
     if free_start:
         sensed = sensed - sensed[: round(START * rate)].mean(axis=0)
