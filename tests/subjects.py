@@ -71,7 +71,7 @@ class Subject:
             warnings.simplefilter("ignore", hr.PlateMismatch)
             return hr.render(rendering.pop("scene", self.scene), **rendering)
 
-    def record_elsewhere(self, bending=None):
+    def record_elsewhere(self, bending=None, block=1):
         """Render on a third party's plate, whose finger keeps the mechanics that it has at the touch.
 
         `bending` is that of `StrangersPlate`; contact is reported 5 ms late.
@@ -83,7 +83,7 @@ class Subject:
             position=lambda time: scene.finger.position(np.clip(time, ON, OFF - 1e-6)),
             load=lambda time: np.interp(time, [ON, OFF], [self.load, 1.25 * self.load]),
             contact=lambda time: 1.0 * ((time >= ON) & (time < OFF)),
-            bending=bending, drive_bits=12, report_lag=5e-3, seed=self.seed, **self.plate,
+            bending=bending, block=block, drive_bits=12, report_lag=5e-3, seed=self.seed, **self.plate,
         )  # fmt: skip
         return self.record(scene=scene, driver=plate)
 

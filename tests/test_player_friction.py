@@ -22,7 +22,7 @@ REST, ZERO = 0.15, 10e-3  # s
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
 TEXTURE = hr.Grating(frequency=100.0, velocity=10e-3)  # on a hybrid both parts play it
 KINDS = {
-    "electroadhesion": lambda: Screen(blind=False, finger=FINGER),
+    "electroadhesion": lambda: Screen(blind=False, finger=FINGER, block=10),
     "ultrasonic": lambda: watched(FINGER),
     "hybrid": bench,
 }
@@ -81,9 +81,9 @@ def test_a_callback_plays_as_a_thread_does(name):
     """To rounding, through changes of texture, on a hybrid to a whole waveform and back; a stop is zero at once."""
     make, other, least = VIBRATING.get(name), hr.Grating(frequency=100.0, velocity=5e-3), 1.0  # V
     if make is None:
-        make, other, least = bench, hr.Chirp(start=80.0, stop=200.0, duration=1.0, amplitude=10e-6), 0.05  # A
+        make, other, least = partial(bench, block=1), hr.Chirp(start=80.0, stop=200.0, duration=1.0, amplitude=10e-6), 0.05  # A
     first, second = (
-        hr.Scene(device="hybrid" if make is bench else "ultrasonic", finger=FINGER, duration=10.0, texture=each)
+        hr.Scene(device="hybrid" if name == "hybrid" else "ultrasonic", finger=FINGER, duration=10.0, texture=each)
         for each in (TEXTURE, other)
     )
     with make() as own, make() as called:
@@ -121,11 +121,11 @@ def test_a_callback_while_the_root_is_changed_plays_the_old_one_or_the_new(first
     """After every field that is written: up to the last one nothing changes; then the bias rises, in 50 ms."""
     louder = hr.Grating(frequency=100.0, velocity=20e-3)
     scene = hr.Scene(device="hybrid", texture=first, finger=FINGER, duration=1.0)
-    driver, played = hr.prepare(scene, driver=bench(), compiled=False).driver, []
+    driver, played = hr.prepare(scene, driver=bench(block=1), compiled=False).driver, []
     driver.state = driver.state.view(Written)
     driver.state.seen = lambda: played.append(driver.convert(np.zeros((driver.block, 3)))[-1, 2])
     before = driver.convert(np.zeros((driver.block, 3)))[-1, 2]
-    shape = hr.prepare(replace(scene, texture=louder), driver=bench(), compiled=False).shape
+    shape = hr.prepare(replace(scene, texture=louder), driver=bench(block=1), compiled=False).shape
     driver.reshape(shape)
     np.testing.assert_allclose(played[:-1], before, rtol=1e-12)
     assert (before == 0.0) == (first is not TEXTURE)
