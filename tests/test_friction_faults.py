@@ -21,7 +21,7 @@ FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
 DEVICES = {
     "ultrasonic": watched,
     "resonator": lambda finger, tell: Resonator(load=lambda time: 0.4, tell=tell, block=16),  # shares no code
-    "electroadhesion": lambda finger, tell: Screen(blind=False, finger=finger, tell=tell),
+    "electroadhesion": lambda finger, tell: Screen(blind=False, block=10, finger=finger, tell=tell),
 }
 FAULTS = {  # what is sensed instead of `sensed`, of which `last` was the last sample
     "healthy": lambda sensed, last, rng: sensed,
@@ -92,7 +92,7 @@ def test_a_sensor_that_fails_is_stopped(kind, fault, within, cause):
     assert START <= found.time <= START + within
     assert recording.flags[-1] & hr.Flag.STOPPED
     drive = np.concatenate(device.played)[:, 0]
-    assert not drive[round((found.time + ZERO) * device.rate) + 1 :].any()
+    assert not drive[round((found.time + ZERO) * device.rate) + device.delay :].any()
     before, after = largest(device.moved, device.rate)
     quiet, loud = largest(device.played, device.rate)
     if kind == "electroadhesion" or "jumped" in cause:
@@ -196,14 +196,7 @@ def test_a_mass_shows_no_step_alone(damping):
 @pytest.mark.parametrize("hold", [2, 10])
 def test_a_converter_that_holds_its_values_is_no_jump(hold):
     """Under a load that comes within no time, and in a fast grating."""
-    held = []
-
-    def tell(sample, sensed):
-        if sample % hold == 0:
-            held[:] = [sensed.sensed.copy()]
-        return sensed._replace(sensed=held[0], motion=None)
-
-    play_steps(tell)
+    play_steps(lambda sample, sensed: sensed._replace(sensed=sensed.sensed[np.arange(10) // hold * hold], motion=None))
 
 
 @pytest.mark.parametrize(("lost", "after"), [(1, 0), (1, 1), (2, -1), (2, 0), (2, 3)])
@@ -211,8 +204,9 @@ def test_samples_that_are_lost_beside_a_step_of_load_are_no_jump(lost, after):
     """Their values are held meanwhile."""
 
     def tell(sample, sensed):
-        gone = 0 <= sample - 3000 - after < lost
-        return sensed._replace(sensed=sensed.sensed * (np.nan if gone else 1.0), motion=None)
+        late = sample + np.arange(10) - 3000 - after
+        gone = (late >= 0) & (late < lost)
+        return sensed._replace(sensed=np.where(gone[:, None], np.nan, sensed.sensed), motion=None)
 
     play_steps(tell)
 
@@ -221,7 +215,7 @@ def play_steps(tell):
     """Play a screen whose sensor shows `tell` under loads that come and go within no time; a stop is an error."""
     loads = (0.0, 0.3, 0.30001, 0.35, 0.35001), (0.2, 0.2, 4.0, 4.0, 0.2)
     finger = hr.Finger.sliding(speed=0.08, normal_load=loads, span=0.05)
-    device = Screen(blind=False, finger=finger, tell=tell)
+    device = Screen(blind=False, block=10, finger=finger, tell=tell)
     assert device.rate == 10e3
     texture = hr.Grating(frequency=400.0, velocity=40e-3)
     hr.render(hr.Scene(texture=texture, finger=finger, device="electroadhesion", duration=0.4), driver=device)
