@@ -199,7 +199,7 @@ def test_a_converter_that_holds_its_values_is_no_jump(hold):
     play_steps(lambda sample, sensed: sensed._replace(sensed=sensed.sensed[np.arange(10) // hold * hold], motion=None))
 
 
-@pytest.mark.parametrize(("lost", "after"), [(1, 0), (1, 1), (2, -1), (2, 0), (2, 3)])
+@pytest.mark.parametrize(("lost", "after"), [(1, 0), (1, 1), (1, 4), (2, -1), (2, 0), (2, 3)])
 def test_samples_that_are_lost_beside_a_step_of_load_are_no_jump(lost, after):
     """Their values are held meanwhile."""
 
