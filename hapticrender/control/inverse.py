@@ -38,7 +38,8 @@ POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 FINGERS, SEED = 300, 1  # fingers of the prior, and the seed that draws them
 REVERSION_RATES = {FINGER: 0.03, HEAVE: 0.003, COUPLING: 0.01, LOAD: 0.6}  # 1/sqrt(s), from each parameter on
 FRICTION_REVERSION = 1.0  # 1/sqrt(s), of a finger's own friction, which stands for the load
-LEARNING_DELAY, RELEARNING_DELAY, DAMPER_TIME = 2e-3, 0.1, 0.1  # s after a contact: learning, again; damper closes
+LEARNING_DELAY, RELEARNING_DELAY = 2e-3, 0.1  # s after a contact begins or ends: learning begins, and once more
+DAMPER_TIME, GATE_CLOSING = 0.1, 0.05  # s after it the damper's gate stays open; then it closes within
 INITIAL_TIME = 60e-3  # s, from the second start of learning on: the deviation at that start is a parameter
 LOSS_TIME = 1e-3  # s without a position, by which a contact is lost
 MODEL_ERROR = 0.1  # of what the drive explains of a deviation: part that no parameter explains
@@ -231,7 +232,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         "damper_high": 1.0 if damping else 0.0,
         "damper_limit": DAMPER_LIMIT,
         **damper_settings(model, damping),
-        "release": period / 0.05,
+        "release": period / GATE_CLOSING,
     }
 
 

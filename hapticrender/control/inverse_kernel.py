@@ -12,7 +12,7 @@ poles, the device's errors dD of stiffness, damping, mass and delay, and the fin
 
 holds whatever was played, and a Kalman filter finds theta; while G and the delay are right, no stability limit follows
 from how fast it learns.  What it finds is played ahead, F = F_nom + sum_i theta_i gamma_i beta_i, with the inner damper
-on dev for a while after contact.
+on dev while its gate is open: 100 ms after a contact begins or ends, and while dev exceeds noise.
 The delay d is that of samples: a block of M samples is the same law with a longer delay.
 """
 

@@ -1,4 +1,4 @@
-"""Inner damper of the waveform law: taps that leave the least of a load's step, with the delay and margins kept.
+"""Inner damper of the waveform law: taps that leave the least of a load's step, with the least margins kept.
 
 With p the motion of a coordinate per force over its static one, hold and delay included, and k its stiffness, every
 feedback of ``K = k q/(1 - p q)`` with a stable q leaves the loop stable, with the sensitivity ``S = 1 - p q`` (Youla's
@@ -94,7 +94,7 @@ def choose_load_damping(model: DeviceModel) -> Damping:
     """Design the inner damper of a device model: in each coordinate the strongest whose margins hold, or none.
 
     rho, the weight of the force, is the least, in steps of 1 %, with which the margins of `margins.LEAST` hold: those
-    of the damper with the bending mode where it was measured, those of the spread at the ends of its tolerance, of a
+    of the damper with the bending mode where it was measured, those of the spread at its ends, of a
     mode that is only expected also a sample later.  A coordinate has no damper where its own damping is a good part of
     what one would add, where the loop comes a period late, or where no rho will do.
     """
@@ -116,7 +116,7 @@ def _chosen(part: Oscillator, bending: BendingMode | None, c: int, rigid: bool) 
 
 
 def margins_hold(part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> bool:
-    """Whether all margins hold with the taps of coordinate `c`, with the bending mode wherever it may lie."""
+    """Whether all margins hold with the taps of coordinate `c`, with the bending mode at the ends of its spread."""
     cases = [(part, bending if bending is not None and bending.measured else None, LEAST["damper"])]
     if bending is not None and bending.coupling[c] != 0.0:
         delays = (0,) if bending.measured else (0, 1)  # the delay was measured with the mode
