@@ -81,7 +81,8 @@ def test_a_callback_plays_as_a_thread_does(name):
     """To rounding, through changes of texture, on a hybrid to a whole waveform and back; a stop is zero at once."""
     make, other, least = VIBRATING.get(name), hr.Grating(frequency=100.0, velocity=5e-3), 1.0  # V
     if make is None:
-        make, other, least = partial(bench, block=1), hr.Chirp(start=80.0, stop=200.0, duration=1.0, amplitude=10e-6), 0.05  # A
+        make, least = partial(bench, block=1), 0.05  # A
+        other = hr.Chirp(start=80.0, stop=200.0, duration=1.0, amplitude=10e-6)
     first, second = (
         hr.Scene(device="hybrid" if name == "hybrid" else "ultrasonic", finger=FINGER, duration=10.0, texture=each)
         for each in (TEXTURE, other)
