@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from test_damping import bending, growth, heave_loop, heave_plant, loop_of, model_of
 
-from hapticrender.control.damping import QUALITY, WORTH, DamperLoop, choose_damping, oscillators
+from hapticrender.control import load_damper
+from hapticrender.control.damping import QUALITY, WORTH, DamperLoop, Oscillator, choose_damping, oscillators
 from hapticrender.control.load_damper import (
     EFFORT_STEP,
     LEAST_EFFORT,
@@ -16,9 +17,9 @@ from hapticrender.control.load_damper import (
     choose_load_damping,
     margins_hold,
 )
-from hapticrender.control.margins import LEAST
+from hapticrender.control.margins import LEAST, LeastMargins
 from hapticrender.control.records import MOST_STRIDE
-from hapticrender.plants.plate import EXPECTED_BENDING
+from hapticrender.plants.plate import EXPECTED_BENDING, PlateParameters
 
 DEVICES = [(5000, 1), (5000, 25), (2000, 1), (1000, 1), (48000, 64), (192000, 1)]  # Hz, samples
 
@@ -145,7 +146,7 @@ def test_it_is_the_strongest_whose_margins_hold():
     holds = [margins_hold(part, design.taps(float(weight)), None, 0) for weight in weights[::10]]
     first = int(np.argmax(holds))
     assert 0 < first
-    assert all(holds[first:])  # bisection finds it
+    assert all(holds[first:])
     found = next(weight for weight in weights if margins_hold(part, design.taps(float(weight)), None, 0))
     np.testing.assert_allclose(chosen, design.taps(float(found)), rtol=1e-9)
     assert not margins_hold(part, 1.25 * chosen, None, 0)
@@ -166,6 +167,31 @@ def test_it_is_off_where_the_mode_damps_itself(quality, on):
     heave = free.damping.copy()
     heave[0, 0] *= ratio / oscillators(free)[0].ratio
     assert choose_load_damping(replace(free, damping=heave)).taps.any(axis=1).tolist() == [on, True]
+
+
+def test_it_is_found_on_odd_plates_whatever_their_unit_of_mass(rng):
+    """Peaks narrower than the design's steps of frequency included, whose normal equations nearly are singular."""
+    rounding = np.finfo(float).eps / load_damper.RIDGE  # times the largest condition
+    for _ in range(20):
+        rate, ratio, mass = (10.0 ** rng.uniform(*each) for each in ((3.0, 5.0), (-4.0, -1.1), (-3.0, 0.0)))
+        part = Oscillator(rate, 1, mass, 2 * np.pi * rng.uniform(20.0, min(400.0, rate / 5)), ratio, 0.7)
+        taps = load_damper._chosen(part, None, 0, True)
+        assert LeastSquares(part, None, 0, rigid=True).left(taps) < 1.0
+        heavy = load_damper._chosen(part._replace(mass=3.0 * mass), None, 0, True)
+        np.testing.assert_allclose(heavy, 3.0 * taps, rtol=0.0, atol=rounding * abs(heavy).max())
+
+
+@pytest.mark.parametrize("frequency", [60.0, 150.0, 190.0])
+def test_a_mode_below_the_usual_spread_is_designed_for(frequency):
+    model = PlateParameters(bending_frequency=frequency).device_model(5000.0, 1)
+    assert choose_load_damping(model).taps[1].any()
+
+
+def test_it_is_off_where_no_margins_hold(monkeypatch):
+    monkeypatch.setitem(LEAST, "damper", LeastMargins(gain=1e6))
+    load_damper._chosen.cache_clear()
+    assert not choose_load_damping(model_of(5000)).on
+    load_damper._chosen.cache_clear()
 
 
 def test_it_is_off_where_none_would_help():

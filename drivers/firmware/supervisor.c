@@ -286,6 +286,12 @@ static uint32_t check_ringing(supervisor_t *s, law_t *law)
 static uint32_t check_limit(supervisor_t *s, const law_t *law)
 {
     uint32_t over = 0u;
+    if (!(law->damper_gain > REAL(0.0))) {
+        s->limit_energy[0] = REAL(0.0);
+        s->limit_energy[1] = REAL(0.0);
+        s->limit_count = 0u;
+        return 0u;
+    }
     for (uint32_t i = 0u; i < 2u; i++) {
         const real_t force = law->damper_gain * law->damper_force[i];
         mean(&s->limit_energy[i], s->p->ring_smoothing, force * force);

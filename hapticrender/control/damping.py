@@ -45,7 +45,9 @@ class BendingMode:
     def corners(self) -> tuple["BendingMode", ...]:
         """Return the mode at either end of its spread, and with either sign where it is an estimate."""
         return tuple(
-            replace(self, frequency=self.frequency + shift, coupling=tuple(sign * each for each in self.coupling))
+            replace(
+                self, frequency=self.frequency + shift, coupling=tuple(sign * each for each in self.coupling), spread=0
+            )
             for sign in ((1,) if self.measured else (1, -1))
             for shift in (-self.spread, self.spread)
         )

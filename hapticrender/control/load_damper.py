@@ -37,7 +37,9 @@ LOW_END = 40.0  # Hz: below it what a load moves counts less and less
 NOISE = 3e-5  # nu: weight of |q|^2, white noise through the damper, over that of the load
 RESERVE, RESERVE_FROM = 5e-4, 450.0  # n; Hz: further weight of |q|^2 above it, for modes that nothing states ...
 NOTCH, WIDE = 0.1, 1.3  # ... and where a bending mode is stated, within so many of its spreads
-LEAST_EFFORT, EFFORT_STEP, STEPS = 0.5, 1.01, 1024  # rho, the weight of the load's force, that are tried
+RIDGE = 1e-12  # of the normal equations, against rounding
+LEAST_EFFORT, EFFORT_STEP, STEPS = 0.5, 1.01, 1024  # rho, the weight of the load's force, that are tried ...
+COARSE = 16  # ... first in steps of so many: on odd plates margins do not only grow with rho
 
 
 class LeastSquares:
@@ -48,7 +50,8 @@ class LeastSquares:
         self.size = next_fast_len(math.ceil(part.rate / RESOLUTION), real=True)
         self.k = part.mass * part.omega**2
         frequency = np.fft.rfftfreq(self.size, 1.0 / part.rate)
-        self.p = self.k * DamperLoop(part, np.ones(1), None, c).response(frequency)[:, 0, 0]
+        resolved = part._replace(ratio=max(part.ratio, 2 * np.pi * RESOLUTION / part.omega))  # a peak of such a width
+        self.p = self.k * DamperLoop(resolved, np.ones(1), None, c).response(frequency)[:, 0, 0]
         step = part.omega / (2 * np.pi) * frequency / np.maximum(frequency, LOW_END) ** 2
         self.load = np.abs(step * self.p) ** 2
         self.noise = np.full(len(frequency), NOISE)
@@ -62,6 +65,7 @@ class LeastSquares:
     def solved(self, weight: Array, linear: Array, count: int) -> Array:
         """FIR filter x (count,), of sum zero, with the least integral of ``weight |x|^2 - 2 Re(conj(x) linear)``."""
         rows, right = (np.fft.irfft(each, self.size)[: count * self.stride : self.stride] for each in (weight, linear))
+        rows[0] *= 1.0 + RIDGE
         free, static = solve_toeplitz(rows, np.stack([right, np.ones(count)], axis=1)).T
         return np.asarray(free - free.sum() / static.sum() * static)
 
@@ -111,8 +115,16 @@ def _chosen(part: Oscillator, bending: BendingMode | None, c: int, rigid: bool) 
         return np.zeros(TAPS)
     design = LeastSquares(part, bending, c, rigid)
     efforts = LEAST_EFFORT * EFFORT_STEP ** np.arange(STEPS)
-    first = bisect_left(efforts, True, key=lambda rho: margins_hold(part, design.taps(rho), bending, c))
-    return design.taps(efforts[first]) if first < STEPS else np.zeros(TAPS)
+
+    def holds(rho: float) -> bool:
+        return margins_hold(part, design.taps(rho), bending, c)
+
+    coarse = next((n for n in range(0, STEPS, COARSE) if holds(efforts[n])), None)
+    if coarse is None:
+        return np.zeros(TAPS)
+    first = bisect_left(efforts, True, max(coarse - COARSE + 1, 0), coarse, key=holds)
+    taps = design.taps(efforts[first])
+    return taps if design.left(taps) < 1.0 else np.zeros(TAPS)
 
 
 def margins_hold(part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> bool:

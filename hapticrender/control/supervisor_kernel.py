@@ -353,6 +353,10 @@ def check_limit(supervisor):
     """Test 4, by the damper: whether its force has been far beyond its limit for longer than in any contact."""
     s = record(supervisor, SUPERVISOR_T, 0)
     p, c, over = s.p, record(s.p.controller, CONTROLLER_T, 0), False
+    if c.damping_gain == 0.0:
+        s.limit_energy[0] = s.limit_energy[1] = 0.0
+        s.limit_count = 0
+        return False
     for i in range(2):
         force = c.damping_gain * c.damper_force[i]
         s.limit_energy[i] += p.ring_smoothing * (force * force - s.limit_energy[i])

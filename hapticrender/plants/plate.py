@@ -115,6 +115,7 @@ class PlateParameters(Validated):
             frequency=self.bending_frequency,
             damping=self.bending_damping,
             coupling=(self.bending_coil / self.bending_mass, 0.0),
+            spread=min(BendingMode.spread, self.bending_frequency / 2),
         )
 
     def displacement(self, position: ArrayLike) -> Array:
