@@ -143,7 +143,7 @@ class Called(Calling):
     sensed_scale, block, delay = 1.0, 10, 10
 
     def __init__(self, kind):
-        self.stopping, self.device = threading.Event(), KINDS[kind]().open()
+        self.stopping, self.device = threading.Event(), KINDS[kind](block=1).open()
         self.rate, self.drive_channels = self.device.rate, self.device.drive_channels
         self.sensed_channels = self.device.sensed_channels
         self.play(np.zeros((1, self.drive_channels)))  # compiles what real time has no time for

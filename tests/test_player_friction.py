@@ -22,9 +22,9 @@ REST, ZERO = 0.15, 10e-3  # s
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
 TEXTURE = hr.Grating(frequency=100.0, velocity=10e-3)  # on a hybrid both parts play it
 KINDS = {
-    "electroadhesion": lambda: Screen(blind=False, finger=FINGER, block=10),
+    "electroadhesion": lambda block=10: Screen(blind=False, finger=FINGER, block=block),
     "ultrasonic": lambda: watched(FINGER),
-    "hybrid": bench,
+    "hybrid": lambda block=10: bench(block=block),
 }
 
 
