@@ -327,3 +327,11 @@ def test_a_failure_to_close_is_raised_where_nothing_else_failed():
 
     with pytest.raises(OSError, match="closed already"):
         hr.render(TONE, driver=simulated(TONE, kind=Closing))
+
+
+def test_the_first_motion_that_is_stated_holds_for_what_was_played_before():
+    """A device's motion may be known from its second block on."""
+    blocks = [{"flags": np.arange(2)}, {"flags": np.arange(2, 5), "motion": np.array([[1.0], [2.0], [3.0]])}]
+    joined = loop._joined(blocks)
+    assert joined["flags"].tolist() == [0, 1, 2, 3, 4]
+    assert joined["motion"].tolist() == [[1.0], [1.0], [1.0], [2.0], [3.0]]
