@@ -182,7 +182,8 @@ def test_it_is_found_on_odd_plates_whatever_their_unit_of_mass(rng):
 
 
 @pytest.mark.parametrize("frequency", [60.0, 150.0, 190.0])
-def test_a_mode_below_the_usual_spread_is_designed_for(frequency):
+def test_a_mode_below_the_usual_spread_is_taken(frequency):
+    """Its spread is half its frequency then; rocking, into which it does not couple, keeps its damper."""
     model = PlateParameters(bending_frequency=frequency).device_model(5000.0, 1)
     assert choose_load_damping(model).taps[1].any()
 
