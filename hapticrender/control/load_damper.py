@@ -100,7 +100,7 @@ def choose_load_damping(model: DeviceModel) -> Damping:
     rho, the weight of the force, is the least, in steps of 1 %, with which the margins of `margins.LEAST` hold: those
     of the damper with the bending mode where it was measured, those of the spread at its ends, of a mode that is only
     expected also a sample later.  A coordinate has no damper where its own damping is a good part of what one would
-    add, where the loop comes a period late, or where no rho will do: none keeps the margins, or it leaves all of a load.
+    add, where the loop comes a period late, or where no rho will do: the margins fail, or all of a load is left.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return no_damping(len(model.mass))
