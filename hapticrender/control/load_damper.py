@@ -83,11 +83,6 @@ class LeastSquares:
         weight *= np.abs(sensitivity) ** 4  # a change x of K/k is one of q by S^2 x
         return self.k * self.solved(weight, weight * q / sensitivity, TAPS)
 
-    def left(self, taps: Array) -> float:
-        """What a load's step leaves with taps (N/m), over what it leaves without a damper, rms with `load`'s weight."""
-        left = self.load / np.abs(1.0 + self.p * self.response(taps / self.k)) ** 2
-        return float(np.sqrt(left.sum() / self.load.sum()))
-
 
 def tap_stride(rate: float) -> int:
     """Samples at `rate` (Hz) from one tap to the next."""
@@ -100,7 +95,7 @@ def choose_load_damping(model: DeviceModel) -> Damping:
     rho, the weight of the force, is the least, in steps of 1 %, with which the margins of `margins.LEAST` hold: those
     of the damper with the bending mode where it was measured, those of the spread at its ends, of a mode that is only
     expected also a sample later.  A coordinate has no damper where its own damping is a good part of what one would
-    add, where the loop comes a period late, or where no rho will do: the margins fail, or all of a load is left.
+    add, where the loop comes a period late, or where the margins fail with any rho.
     """
     if not (model.mass.diagonal() > 0.0).all():
         return no_damping(len(model.mass))
@@ -123,8 +118,7 @@ def _chosen(part: Oscillator, bending: BendingMode | None, c: int, rigid: bool) 
     if coarse is None:
         return np.zeros(TAPS)
     first = bisect_left(efforts, True, max(coarse - COARSE + 1, 0), coarse, key=holds)
-    taps = design.taps(efforts[first])
-    return taps if design.left(taps) < 1.0 else np.zeros(TAPS)
+    return design.taps(efforts[first])
 
 
 def margins_hold(part: Oscillator, taps: Array, bending: BendingMode | None, c: int) -> bool:

@@ -67,7 +67,7 @@ class Curve:
         place = np.minimum(place, 2 * last - place)
         index = np.minimum(place.astype(np.intp), last - 1)
         u = place - index
-        a, b, c, d = (self.values[last - np.abs(last - np.abs(index + k))] for k in (-1, 0, 1, 2))
+        a, b, c, d = self.values[last - np.abs(last - np.abs(np.add.outer(range(-1, 3), index)))]
         inner = (u + 1) * (2 - u) / 2 * ((1 - u) * b + u * c)
         return inner - u * (1 - u) / 6 * ((2 - u) * a + (u + 1) * d)
 
