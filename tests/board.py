@@ -21,7 +21,8 @@ from hapticrender.export import export
 ROOT = Path(__file__).resolve().parent.parent
 FIRMWARE = ROOT / "drivers" / "firmware"
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffp-contract=off")
-SANITISED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+CAREFUL = "-Wconversion -Wshadow -Wcast-qual -Wundef -Wstrict-prototypes -Wmissing-prototypes -Wvla".split()
+SANITISED = ("-Og", "-g1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 SOURCES = "board board_commands board_telemetry board_textures frames texture plate hardware_posix".split()
 SOURCES += "law learning carriers supervisor gains".split()
 RATE = 5000.0  # Hz

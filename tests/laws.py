@@ -4,7 +4,7 @@ import ctypes
 from types import SimpleNamespace
 
 import numpy as np
-from board import ROOT, compile_c
+from board import CAREFUL, ROOT, compile_c
 from waves import Own, white
 
 import hapticrender as hr
@@ -110,7 +110,7 @@ class Exports:
         folder = self.folder / texture.replace(" ", "-")
         if not folder.exists():
             export(self.rendering(texture), folder)
-        options = ("-O2", "-fPIC", KINDS[kind], f"-I{folder}")
+        options = ("-O1", "-fPIC", KINDS[kind], f"-I{folder}", *CAREFUL, "-Wdouble-promotion")
         sizes = kind, (folder / "design.h").read_text()
         if sizes not in self.parts:  # designs of equal sizes share all but their tables
             files = [*(folder / f"{name}.c" for name in PARTS[:-1]), ROOT / "tests" / "law_step.c"]
