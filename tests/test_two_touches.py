@@ -60,10 +60,13 @@ def noise():
     return hr.Recorded(samples=white(29_599, 5e-6), rate=RATE, gain=1.0)
 
 
-def wrong(position, told, kind=StrangersPlate):
-    """A plate that is wrong in everything, with a heavy finger from 1 s on, reported 5 ms late."""
+def wrong(position, late, kind=StrangersPlate):
+    """A plate that is wrong in everything, with a heavy finger from 1 s on, reported 5 ms late.
+
+    In blocks of 5; it is a sample later than they take, of which `late` is told.
+    """
     touch = {"finger": HEAVY, "load": 0.8, "contact": lambda time: 1.0 * (time > 1.0), "report_lag": 5e-3}
-    return kind(position=position, told=told, **touch, **WRONG)
+    return kind(position=position, block=5, told=5 + late, **touch, **WRONG)
 
 
 def test_false_alarms_are_as_stated(rng):
@@ -78,7 +81,7 @@ def test_false_alarms_are_as_stated(rng):
 
 def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
     """The statistic is that of noise: with up to 11 degrees of freedom less, for the errors that were in fact none."""
-    plate, finger = wrong(lambda time: 0.02 * np.sin(4.0 * time), 2), hr.Finger.sliding(0.08, 0.8)
+    plate, finger = wrong(lambda time: 0.02 * np.sin(4.0 * time), 1), hr.Finger.sliding(0.08, 0.8)
     rendering = hr.prepare(hr.Scene(texture=noise, finger=finger, duration=3.0), driver=plate)
     recording = hr.run(rendering)
     assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
@@ -93,7 +96,7 @@ def test_one_sliding_finger_on_a_wrong_plate_is_one(noise):
 def test_a_delay_that_is_a_sample_longer_than_stated_is_no_second_finger():
     """Half a radian of the drive's force at 400 Hz, which nothing but the law's own drive has excited in rocking."""
     scene = hr.Scene(texture=hr.Grating(frequency=400.0, amplitude=50e-6), finger=hr.Finger.absent(), duration=2.0)
-    rendering = hr.prepare(scene, driver=wrong(27.5e-3, 1))
+    rendering = hr.prepare(scene, driver=wrong(27.5e-3, 0))
     recording = hr.run(rendering)
     assert not (recording.flags & hr.Flag.TWO_TOUCHES).any()
     for _, each in windows_under_touch(recording, rendering.model):
@@ -108,7 +111,7 @@ def test_a_finger_behind_a_slow_touch_panel_is_one():
             sensed = super().play(drive)
             return sensed._replace(position=self.reader(sensed.position))
 
-    plate = wrong(lambda time: 0.1 / (6 * np.pi) * np.sin(6 * np.pi * time), 2, Located)
+    plate = wrong(lambda time: 0.1 / (6 * np.pi) * np.sin(6 * np.pi * time), 1, Located)
     plate.reader = PanelReader(PANELS["panel, 60 Hz, 25 ms"], RATE, 1)
     texture, finger = hr.Grating(frequency=120.0, amplitude=5e-6), hr.Finger.sliding(0.08, 0.8)
     recording = hr.render(hr.Scene(texture=texture, finger=finger, duration=3.0), driver=plate)
