@@ -326,8 +326,8 @@ def attempt(change):
 
 @pytest.mark.slow
 def test_a_bad_line_never_plays_what_was_not_asked_for(tmp_path, rng, monkeypatch):
-    """150 s of the board's time at a share of 1 % of faulty bytes."""
-    seconds = 150
+    """60 s of the board's time at a share of 1 % of faulty bytes."""
+    seconds = 60
     monkeypatch.setattr("secrets.randbelow", lambda most: int(rng.integers(most)))
     faults = Faults(18, 0.01)
     with SteppedBoard(tmp_path) as board:

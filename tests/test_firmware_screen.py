@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board import RATE, SANITISED, SCENE, SLOW, BoardProcess, SlowClock, SteppedBoard, build_board, compile_c, tones
-from laws import KINDS, PARTS
+from board import RATE, SANITISED, SCENE, SLOW, BoardProcess, SlowClock, SteppedBoard, build_board, tones
+from laws import KINDS
 from test_board_live import wait_for
-from test_firmware_law import CAREFUL
 
 import hapticrender as hr
 from hapticrender.bands import Bands, hold_last
@@ -178,7 +177,7 @@ def test_a_screen_plays_live(program, tmp_path):
             for texture, hertz, speed in ((RIDGES, 50.0, 0.05), (tone, 80.0, -0.05)):
                 player.play(texture)
                 start, began = driver.client.clock.monotonic(), place
-                while (slid := driver.client.clock.monotonic() - start) < 0.5:
+                while (slid := driver.client.clock.monotonic() - start) < 0.3:
                     place = began + speed * slid
                     player.finger(place, speed, 0.4)
                     player.sleep(0.01)
@@ -227,28 +226,14 @@ def test_what_no_board_plays_is_refused(tmp_path, change, problem):
             SCENE,
             "device = 'vt-plate': .*has the law of 'electroadhesion' on it: export this scene to it, or take another",
         ),
-        (replace(SCREEN, device="hybrid", profile={}), "device = 'hybrid': .*has the law of 'electroadhesion' on it: "),
-        (
-            replace(SCREEN, device="ultrasonic", profile={}),
-            "device = 'ultrasonic': .*has the law of 'electroadhesion' on",
-        ),
         (replace(SCREEN, rendering={"square_root": "off"}), "square_root = 'off': must be 'on' on a board"),
     ],
-    ids=["plate", "hybrid", "ultrasonic", "square root off"],
+    ids=["plate", "square root off"],
 )
 def test_other_devices_are_refused_by_a_screens_board(program, tmp_path, scene, problem):
     refused = pytest.raises(ValueError, match=problem)
     with SteppedBoard(tmp_path, program=program) as board, refused:
         hr.render(scene, driver=board.driver())
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_careful_warnings_find_nothing(exports, kind):
-    exports.renderings["screen"] = hr.prepare(SCREEN)
-    exports.law("screen", kind)
-    folder = exports.folder / "screen"
-    for name in PARTS:
-        compile_c(folder / f"{name}.o", [folder / f"{name}.c"], *CAREFUL, "-Wdouble-promotion", KINDS[kind], "-c")
 
 
 def test_a_profiles_mean_square_reaches_the_board_and_targets_know_no_blocks(program, tmp_path, library):
