@@ -16,9 +16,9 @@ from test_ultrasonic_rendering import watched
 import hapticrender as hr
 from hapticrender.live_loop import LiveLoop
 
-START = 0.2  # s: when it fails
+START = 0.1  # s: when it fails
 HANG = 0.1  # s
-REST, ZERO = 0.15, 10e-3  # s
+REST, ZERO = 0.13, 10e-3  # s
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
 TEXTURE = hr.Grating(frequency=100.0, velocity=10e-3)  # on a hybrid both parts play it
 KINDS = {

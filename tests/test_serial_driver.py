@@ -1,7 +1,6 @@
 """Boards: the compiled firmware as a process behind a pseudo-terminal, played through the drivers."""
 
 import os
-import subprocess
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -40,11 +39,6 @@ def test_a_port_without_a_name_is_refused():
         open_driver("serial:")
 
 
-def test_the_board_as_a_process_prints_its_usage():
-    found = subprocess.run([program_of("-O2")], capture_output=True, text=True, check=False)
-    assert (found.returncode, found.stderr.partition(" [")[0]) == (2, "usage: board LINK")
-
-
 def test_the_verb_latency_states_the_delay_of_a_boards_design(tmp_path, capsys):
     delay = hr.prepare(SCENE).model.delay
     with BoardProcess(program_of("-O2"), tmp_path) as board:
@@ -53,14 +47,8 @@ def test_the_verb_latency_states_the_delay_of_a_boards_design(tmp_path, capsys):
 
 
 @pytest.fixture
-def stepped(tmp_path):
-    with SteppedBoard(tmp_path) as board:
-        yield board
-
-
-@pytest.fixture
 def fast(tmp_path):
-    """The same without sanitisers."""
+    """Without sanitisers, under which `test_board_faults` plays."""
     with SteppedBoard(tmp_path, program=program_of("-O2")) as board:
         yield board
 
@@ -91,8 +79,8 @@ def test_a_finger_begins_with_the_run_however_long_the_board_takes_to_be_set_up(
     assert np.diff(position[begun:]) * RATE == pytest.approx(0.1, rel=0.2)  # 0.2 mm, approached within 10 ms
 
 
-def test_a_scene_that_no_board_can_play_is_refused(stepped):
-    driver = stepped.driver()
+def test_a_scene_that_no_board_can_play_is_refused(fast):
+    driver = fast.driver()
     with pytest.raises(DriverError, match="device_loop: method 'h2' of this scene cannot run on a board"):
         hr.render(SCENE, driver=driver, method="h2")
     with driver, pytest.raises(DriverError, match="play: the loop runs on the board"):
@@ -187,8 +175,8 @@ def test_the_limits_of_a_device_are_held_live_on_a_board(fast):
     assert others == [0.25, 1e3, 4e-4]
 
 
-def test_textures_gain_and_finger_change_while_it_plays(stepped):
-    client = stepped.client().open()
+def test_textures_gain_and_finger_change_while_it_plays(fast):
+    client = fast.client().open()
     client.set_bands(tones(47.0, amplitude=10e-6))
     client.limits(0.5)
     client.finger(0.01, 0.0, 0.4)
@@ -198,7 +186,7 @@ def test_textures_gain_and_finger_change_while_it_plays(stepped):
         change()
         for _ in range(10):
             client.finger(0.01, 0.0, 0.4)
-            stepped.run(client, 0.05)
+            fast.run(client, 0.05)
         found.append(client.telemetry())
     assert [telemetry.state for telemetry in found] == 3 * [State.PLAYING]
     assert [[abs(band.target) for band in each.bands] for each in found] == [
@@ -214,15 +202,15 @@ def test_textures_gain_and_finger_change_while_it_plays(stepped):
         assert 0 < telemetry.cycles < telemetry.cycles_most
     assert found[2].commits == 2
     client.stop()
-    stepped.run(client, 0.1)
+    fast.run(client, 0.1)
     assert client.telemetry()[4:6] == (State.IDLE, Cause.COMMAND)
     client.close()
     with pytest.raises(DriverError, match="it is not open"):
         client.telemetry()
 
 
-def test_refusals_name_port_command_and_bytes(stepped):
-    client = stepped.client().open()
+def test_refusals_name_port_command_and_bytes(fast):
+    client = fast.client().open()
     client.limits(client.capabilities.drive_limit)
     with pytest.raises(DriverError, match=r"stepped: START: .*: state: nothing is set, .* \(00 00 64 00, 4 bytes\)"):
         client.start()
