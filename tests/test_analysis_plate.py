@@ -84,16 +84,15 @@ def test_changes_of_the_plate_are_followed(drift, creep, rng):
 
 
 def test_without_an_unloaded_span_the_profile_is_taken_and_said(rng):
-    found = analyse_finger(drifting({}, 0.0, (0.0, DURATION + 1), rng))
+    """With its uncertainty, where it has one."""
+    recording = drifting({}, 0.0, (0.0, DURATION + 1), rng)
+    found = analyse_finger(recording)
     assert not found.plate.measured
     assert any("no unloaded span" in note for note in found.notes)
     spread = [found.plate.standard_errors[name][0] / getattr(PlateParameters(), name) for name in found.plate.values]
     np.testing.assert_allclose(spread, [0.02, 0.02, 0.1, 0.1], rtol=1e-9)
-
-
-def test_uncertainty_of_a_profile_is_taken(rng):
     device = {"stiffness_1": 22.4e3, "stiffness_2": 22.9e3}
     profile = hr.DeviceProfile(kind="vt-plate", device=device, uncertainty=dict.fromkeys(device, 5.0))
-    found = analyse_finger(drifting({}, 0.0, (0.0, DURATION + 1), rng), profile)
+    found = analyse_finger(recording, profile)
     assert found.plate.standard_errors["stiffness_1"][0] == pytest.approx(5.0)
     assert found.normal_load.standard_error[20_000] < 0.003  # 0.006 N by 2 % of the stiffness, 0.0023 N by noise

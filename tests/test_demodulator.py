@@ -116,12 +116,12 @@ def test_the_measured_innovation_of_the_observer_is_the_predicted_one(frequency)
     loop, carriers = error_loop(MODEL, COMB, SETTINGS, "low"), np.exp(2j * np.pi * COMB / RATE)
     turn, envelope, level, drift, measured = np.ones(5, complex), np.zeros(5, complex), 0.0, 0.0, []
     z = np.exp(2j * np.pi * frequency / RATE)
-    for n in range(40_000):  # the slowest pole, of the DC estimate, has died away by exp(-90) in the first 20 000
+    for n in range(25_000):  # the slowest pole, of the DC estimate, has died away by exp(-90) in the first 20 000
         e = (z**n).real - level - (envelope * turn).real.sum()
         envelope = envelope + SETTINGS["observer"] * e * turn.conj()
         level, drift = level + SETTINGS["dc"] * e + drift, drift + SETTINGS["dc_drift"] * e
         turn = turn * carriers
         measured.append(e)
     predicted = 0.0 if frequency in COMB else 1.0 / loop.controller(np.array([z]))[1][0]
-    expected = (predicted * z ** np.arange(20_000, 40_000)).real
+    expected = (predicted * z ** np.arange(20_000, 25_000)).real
     np.testing.assert_allclose(measured[20_000:], expected, rtol=0, atol=1e-9)
