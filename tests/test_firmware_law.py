@@ -134,6 +134,7 @@ def assert_both_stop(exports, cause, sensed, position):
         assert abs(np.diff(stops)) <= (0 if kind == "double" else 5), kind
         if kind == "double":
             assert_same((found, found_flags), drive, flags)
+    return stops[0]
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -145,6 +146,20 @@ def test_the_supervisor_equals_the_librarys(exports, fault):
     sensed, position = signals.sensed[:9000].copy(), np.ascontiguousarray(signals.position[:9000])
     sensed[4500:, 0] = disturb(sensed[4500:, 0])
     assert_both_stop(exports, cause, sensed, position)
+
+
+def test_a_contact_that_begins_or_ends_holds_one_test_of_both(exports):
+    """An inverted sensor is inconsistent with the drive 60 ms after the last of them, and 12 ms after the first one."""
+    signals = close(kernel_of(exports, "tones"), FINGERS["slide"], TEXTURES["tones"])[2]
+    sensed, stops = signals.sensed[:9000].copy(), []
+    sensed[4500:, 0] *= -1.0
+    for taps in ((), np.arange(4500, 5500, 200)):
+        position = np.ascontiguousarray(signals.position[:9000])
+        for each in taps:
+            position[each : each + 100] = np.nan
+        stops.append(assert_both_stop(exports, causes.INCONSISTENT, sensed, position))
+    assert stops[0] < 5000
+    assert stops[1] > 5400 + 300
 
 
 @pytest.mark.parametrize(

@@ -212,10 +212,10 @@ static supervisor_cause_t check_motion(supervisor_t *s)
         }
     }
     judge_energies(s, &wrong, &active);
-    if (wrong != 0u) {
-        s->inconsistent_count += (danger != 0u) ? 4u : 1u;
-    } else {
-        s->inconsistent_count = less_one(less_one(s->inconsistent_count));
+    if ((danger != 0u) || (s->contact_count == 0u)) { /* a press that begins or ends is no fault */
+        const uint32_t more = (danger != 0u) ? 4u : 1u;
+        const uint32_t count = s->inconsistent_count;
+        s->inconsistent_count = (wrong != 0u) ? (count + more) : less_one(less_one(count));
     }
     s->active_count = counted(s->active_count, active & danger);
     s->motion_count = counted(s->motion_count, (motion > p->most_motion) ? 1u : 0u);
@@ -397,6 +397,9 @@ uint32_t supervisor_step(
         s->input[2u + i] = REAL(0.5) * (s->force[i] + s->forces[s->at][i]);
         s->force[i] = s->forces[s->at][i];
     }
+    const uint32_t touched = isfinite(position) ? 1u : 0u;
+    s->contact_count = (touched != s->touched) ? s->p->drive_time : less_one(s->contact_count);
+    s->touched = touched;
     const supervisor_cause_t cause = check(s, law, sensed, drive);
     s->cause = (s->cause == SUPERVISOR_FINE) ? cause : s->cause;
     if (s->cause != SUPERVISOR_FINE) {

@@ -161,7 +161,7 @@ class SupervisedController(Addressed):
         for name, value in settings.items():
             self.state["p"][name] = value
         self.state["fade"] = self.state["damper_scale"] = 1.0
-        self.state["last"] = 0.0
+        self.state["last"], self.state["position"] = 0.0, math.nan
         self.channels, self.sensors = int(settings["channels"]), int(settings["sensors"])
 
     def __getattr__(self, name: str) -> Any:

@@ -13,7 +13,8 @@ no  cause        condition                                                      
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves; or the device's last block of samples,
                  for as many samples, and 2 ms, while the drive does not repeat itself            at once
-3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F                     15 to 60 ms
+3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F; held for 60 ms     15 to 60 ms
+                 after a contact begins or ends, but in danger
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
                  or > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s ("slowly")       0.3 s
                  or the inner damper asks for more than 2.5 times its limit, rms over 3 ms        15 ms
@@ -91,7 +92,7 @@ SETTINGS = np.dtype(
     ]
 )
 """Settings of a supervisor, as `design_supervisor` derives them: factors and fades per sample, times in samples."""
-COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow", "limit")
+COUNTS = ("inconsistent", "active", "drive", "motion", "ring", "ring_wait", "slow", "limit", "contact")
 SUPERVISOR = np.dtype(
     [
         ("p", SETTINGS),
@@ -277,7 +278,9 @@ def check_motion(supervisor):
         by_drive = residual < BY_DRIVE * drive
         wrong |= by_drive and residual > bound
         active |= by_drive and power > 0.0 and power * power > POWER * POWER * drive * e[2 + i]
-    s.inconsistent_count = s.inconsistent_count + (4 if danger else 1) if wrong else max(s.inconsistent_count - 2, 0)
+    if danger or s.contact_count == 0:  # a press that begins or ends is no fault
+        count = s.inconsistent_count
+        s.inconsistent_count = count + (4 if danger else 1) if wrong else max(count - 2, 0)
     s.active_count = s.active_count + 1 if active and danger else 0
     s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
     if s.motion_count >= 5:
@@ -399,6 +402,8 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     for i in range(2):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
     acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
+    begins_or_ends = (position[n] == position[n]) != (s.position == s.position)
+    s.contact_count = p.drive_time if begins_or_ends else max(s.contact_count - 1, 0)
     s.position = position[n]
     cause, invalid = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
     if check_drive(supervisor, drive, n) and cause == 0:
