@@ -81,6 +81,12 @@ def loud_arithmetic() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def empty_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave pictures of recordings empty: drawing one takes longer than playing what it shows."""
+    monkeypatch.setattr("hapticrender.report.picture.plot", lambda recording, path: Path(path).touch())
+
+
 @pytest.fixture(scope="module")
 def exports(tmp_path_factory):
     """Designs of the textures of `laws`, and their laws in C."""
