@@ -27,7 +27,7 @@ def friction(square_root: str) -> np.ndarray:
     """Last 0.1 s of the friction (N)."""
     grating = hr.Grating(frequency=FREQUENCY, amplitude=0.64 * FORCE / (2 * np.pi * FREQUENCY))
     drive = {"square_root": square_root, "headroom": 1.0, "floor": 0.0}  # at full swing: the envelope touches zero
-    scene = hr.Scene(texture=grating, finger=FINGER, device="electroadhesion", duration=0.5, rendering=drive)
+    scene = hr.Scene(texture=grating, finger=FINGER, device="electroadhesion", duration=0.3, rendering=drive)
     driver = OpenLoop(ElectroadhesionScreen(SCREEN, FINGER))
     driver.sensed_channels = 0
     return hr.render(scene, driver=driver).motion[-1000:, 0]

@@ -71,8 +71,8 @@ class ShakerRenderer(BaseRenderer):
 
 
 def main() -> float:
-    finger = hr.Finger.still(normal_load=0.4, touches=[(1.0, 2.0)], mechanics="light-2nd-order")
-    scene = hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=20e-6), finger=finger, device="shaker", duration=3.0)
+    finger = hr.Finger.still(normal_load=0.4, touches=[(1.0, 1.5)], mechanics="light-2nd-order")
+    scene = hr.Scene(texture=hr.Grating(frequency=80.0, amplitude=20e-6), finger=finger, device="shaker", duration=2.0)
     return hr.render(scene, renderer=ShakerRenderer()).summary()["bands"][0]["rms_error_top"]
 
 

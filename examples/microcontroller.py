@@ -36,7 +36,7 @@ def build(scene: hr.Scene, folder: Path) -> Path:
 
 def main() -> float:
     finger = hr.Finger.sliding(speed=0.04, span=0.04, normal_load=0.4, mechanics="heavy-2nd-order")
-    scene = hr.Scene(texture=hr.Grating(wavelength=0.5e-3, amplitude=10e-6), finger=finger, duration=2.0)
+    scene = hr.Scene(texture=hr.Grating(wavelength=0.5e-3, amplitude=10e-6), finger=finger, duration=1.5)
     with tempfile.TemporaryDirectory() as name:
         program, port = build(scene, Path(name)), Path(name) / "port"
         board = subprocess.Popen([program, port, "--slow", str(SLOWER)])

@@ -42,7 +42,7 @@ class MyPlate:
 
 
 def main() -> float:
-    scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=3.0)
+    scene = hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=10e-6), duration=2.0)
     recording = hr.render(scene, driver=MyPlate())
     (band,) = recording.summary()["bands"]
     print(f"target {1e6 * band['target']:.2f} um, moved {1e6 * band['achieved']:.2f} um")
