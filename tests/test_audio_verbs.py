@@ -108,6 +108,7 @@ def assert_accurate(recording):
     assert abs(phasor(recording.motion[end, 0], 60.0, RATE) - wanted) < 0.01 * 10e-6
 
 
+@pytest.mark.usefixtures("empty_pictures")
 def test_a_card_is_identified_and_a_scene_on_its_profile_rendered_validated_and_played(plate, scene, tmp_path, capsys):
     """By the command line; the profile has the delay of the card alone, to which `render` adds what `play` queues.
 
@@ -176,7 +177,6 @@ def hang(player):
 ENDS = {  # what ends an application, and how
     "exception": (lambda player: 1 // 0, ZeroDivisionError),
     "SIGTERM": (lambda player: signal.raise_signal(signal.SIGTERM), Terminated),
-    "SIGINT": (lambda player: signal.raise_signal(signal.SIGINT), KeyboardInterrupt),
     "hangs": (hang, hr.WatchdogTimeout),
 }
 
@@ -227,7 +227,7 @@ import hapticrender as hr
 import hapticrender.player
 from hapticrender.drivers import portaudio
 
-hapticrender.player.TIMEOUT = portaudio.CLOSE_TIMEOUT = 2.0
+hapticrender.player.TIMEOUT = portaudio.CLOSE_TIMEOUT = 1.0
 folder, program, how = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
 with ExitStack() as stack:
     server = stack.enter_context(ExitStack())
@@ -259,7 +259,7 @@ with ExitStack() as stack:
 
 LOST = {
     "ends": r"DeviceLost: audio:plate: the card stopped after \d+ samples: is it still connected",
-    "halts": r"DeviceTimeout: the device has played no sample for 2",
+    "halts": r"DeviceTimeout: the device has played no sample for 1",
 }
 
 
@@ -273,7 +273,7 @@ def test_a_card_that_goes_away_under_a_player_is_a_lost_device(jack_program, tmp
     done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     assert re.search(f"^hapticrender.errors.{LOST[how]}", done.stderr, re.M), done.stderr
-    assert "and while closing: audio:plate: close: PortAudio did not return within 2 s" in done.stderr
+    assert "and while closing: audio:plate: close: PortAudio did not return within 1 s" in done.stderr
     recording = hr.Recording.load(tmp_path / "lost.au")
     assert recording.flags[-1] == Flag.STOPPED
     assert not recording.drive[-1].any()
