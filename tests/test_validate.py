@@ -8,11 +8,12 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from functools import partial
 from xml.etree import ElementTree
 
 import pytest
+from test_player_faults import full_disk
 
+from hapticrender.cli import main
 from hapticrender.errors import PlateMismatch
 from hapticrender.loop import render
 from hapticrender.touch.builtin_scenes import builtin_scenes
@@ -73,17 +74,12 @@ def test_scenes_of_one_name_are_told_apart_by_their_files(tmp_path):
     assert [str(each).count(str(file)) for each, file in zip(found, files, strict=True)] == [0, 1, 1]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
 @pytest.mark.parametrize("option", ["--json", "--junit"])
-def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, option):
-    import resource
-
+def test_a_report_that_cannot_be_written_whole_leaves_the_older_one(tmp_path, capsys, option):
     (tmp_path / "r").write_text("older")
-    command = [sys.executable, "-m", "hapticrender", "validate", *["no-such-scene"] * 50, option, str(tmp_path / "r")]
-    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (512, 512))
-    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
-    assert done.returncode == 2
-    assert f"{option} = '{tmp_path / 'r'}': File too large" in done.stderr
+    with full_disk(512):
+        assert main(["validate", *["no-such-scene"] * 50, option, str(tmp_path / "r")]) == 2
+    assert f"{option} = '{tmp_path / 'r'}': File too large" in capsys.readouterr().err
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("r", "older")]
 
 
@@ -190,7 +186,7 @@ def test_what_is_not_wholly_passed_is_so_in_every_report(verdicts, tmp_path, kin
     assert [child.tag for child in suite.findall("testcase")[1]] == [tag]
 
 
-def test_only_what_does_not_pass_leaves_its_files(tmp_path):
+def test_only_what_does_not_pass_leaves_its_files(tmp_path, empty_pictures):
     strict = replace(SHORT, tolerance=1e-6, name="a strict one")
     validate([SHORT, strict], out=tmp_path / "out")
     (folder,) = (tmp_path / "out").iterdir()
