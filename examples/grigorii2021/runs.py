@@ -159,7 +159,7 @@ def press() -> Item:
     off = {
         (target, method): np.array(
             [
-                _off(_run(each, target, finger, method, 9.0, sensor_noise=0.0), each, target, 4.0, 9.0)[0]
+                _off(_run(each, target, finger, method, 6.0, sensor_noise=0.0), each, target, 4.0, 6.0)[0]
                 for each in FREQUENCIES.tolist()
             ]
         )
