@@ -1,4 +1,4 @@
-"""The charts of benchmarks/charts: what cannot be measured, and that the largest is drawn."""
+"""The charts of benchmarks/charts: that the largest is drawn, of two of its cases."""
 
 import pytest
 
@@ -7,6 +7,6 @@ pytest.importorskip("matplotlib")
 from benchmarks.charts import stability, stability_map
 
 
-def test_the_stability_chart_is_drawn():
-    rows = stability.measure(frequencies=2, bandwidths=2)
-    stability.draw(rows, [stability_map.damper_map(stability.CASES[0])] * len(stability.CASES))
+def test_the_stability_chart_is_drawn(monkeypatch):
+    monkeypatch.setattr(stability, "CASES", stability.CASES[:2])
+    stability.draw(stability.measure(2, 2), [stability_map.damper_map(stability.CASES[0])] * 2)
