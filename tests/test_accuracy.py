@@ -1,4 +1,7 @@
-"""The accuracy suite: the default method keeps every bound, others miss theirs; gratings and overload beside it."""
+"""The accuracy suite: the default method keeps its bounds, others miss theirs; gratings and overload beside it.
+
+``hapticrender validate --suite accuracy`` plays every row.  Here is one of each texture, touch, block and device kind.
+"""
 
 import json
 
@@ -10,20 +13,31 @@ from test_figures import ON_THE_STRANGERS_PLATE
 
 import hapticrender as hr
 from hapticrender import defaults
-from hapticrender.accuracy import friction
+from hapticrender.accuracy import friction, plate
 from hapticrender.accuracy.suite import CASES, METHOD_FREE, TARGETS, as_rows, run_suite, write_json
 from hapticrender.protocols import Flag
 from hapticrender.recordings.columns import unwrap_counts
 
 MISSES = {  # bounds that the default method misses: each is in docs/figures.md, or within its last digit there
     "white modes": {"free", "slide"},
-    "tones bent": {"finger"},
     "comb bent": {"finger", "first"},
     "sweeps": {"400 Hz/s"},
-    "sweeps bent": {"200 Hz/s", "400 Hz/s", "800 Hz/s"},
-    "touch modes": {"centre"},
-    "touch 10 um": {"end"},
 }
+ELSEWHERE = {  # rows that run what others do, for longer
+    "waves",  # white modes; test_figures: a recorded swipe
+    "random fingers",  # touch, sweeps
+    "free wrong",  # free, tones wrong
+    "tones bent",  # tones, comb bent
+    "sweeps bent",  # sweeps, comb bent
+    "touch modes",  # touch, white modes
+    "touch rigid",  # touch wrong, touch blocks
+    "touch 48 kHz",  # touch blocks, white 48 kHz
+    "touch 10 um",  # touch blocks
+    "small",  # wobble
+    "identified",  # test_identify
+    "ultrasonic: tones",  # its comb, swipes and velocity
+}
+PLAYED = [case for case in CASES if case not in ELSEWHERE | set(ON_THE_STRANGERS_PLATE)]
 
 
 def missed(figures):
@@ -37,8 +51,9 @@ def test_every_case_has_its_targets_and_every_target_its_case():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", [case for case in CASES if case not in ON_THE_STRANGERS_PLATE])
-def test_the_default_method_keeps_every_bound_but_those_known(case):
+@pytest.mark.parametrize("case", PLAYED)
+def test_the_default_method_keeps_every_bound_but_those_known(case, monkeypatch):
+    monkeypatch.setitem(plate.CASES, "touch", plate.worst_touch)
     figures = run_suite(["inverse"], [case])
     assert {key for _, key, _ in missed(figures)} == MISSES.get(case, set()), missed(figures)
 
