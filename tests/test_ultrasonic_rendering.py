@@ -156,9 +156,9 @@ def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():
     assert not recording.motion[away, 0].any()
 
 
-def watched(finger=SLIDE, **tell):
-    """A resonant plate as a user's device, in blocks of 16: only the test gets its amplitude."""
-    return Told(UltrasonicPlate(UltrasonicParameters(delay=16), finger, block=16), **tell)
+def watched(finger=SLIDE, block=16, **tell):
+    """A resonant plate as a user's device, in blocks: only the test gets its amplitude."""
+    return Told(UltrasonicPlate(UltrasonicParameters(delay=block), finger, block=block), **tell)
 
 
 @pytest.mark.parametrize("load", [0.0, 0.4, 15.0])
