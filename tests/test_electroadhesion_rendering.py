@@ -35,8 +35,8 @@ def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
 
 def test_a_friction_coefficient_other_than_assumed_is_corrected():
     """A driver of the user's own, whose finger has another mu than the scene's 0.8."""
-    mu = 0.5
-    recording = hr.render(tone(100.0, duration=1.0, finger=SLIDE), driver=Screen(blind=False, friction_coefficient=mu))
+    screen = Screen(blind=False, block=10, friction_coefficient=0.5)
+    recording = hr.render(tone(100.0, duration=1.0, finger=SLIDE), driver=screen)
     assert band(recording)["rms_error_friction"] < NOISE
 
 
