@@ -58,7 +58,7 @@ def ringing(rate, delay, taps, mode=None):
     return float(np.sqrt(np.sum(abs(step) ** 2)))
 
 
-@pytest.mark.parametrize(("rate", "delay"), [(5000, 1), (5000, 25), (2000, 1), (1000, 1), (20000, 4)])
+@pytest.mark.parametrize(("rate", "delay"), [(5000, 1), (5000, 25), (1000, 1), (20000, 4)])
 def test_a_load_leaves_less_than_with_the_viscous_damper(rate, delay):
     """Sample by sample, not by the design's integral."""
     model = expected_of(rate, delay)
@@ -123,7 +123,7 @@ def test_a_damper_that_knows_of_no_mode_drives_one():
 
 
 @pytest.mark.parametrize("coil", [-0.1, 0.1])
-@pytest.mark.parametrize("frequency", [450.0, 500.0, 600.0, 700.0, 850.0, 1150.0, 2000.0])
+@pytest.mark.parametrize("frequency", [450.0, 600.0, 850.0, 2000.0])
 def test_a_measured_mode_keeps_its_margin_anywhere_within_its_spread(frequency, coil):
     """100 Hz to either side, and not at the ends alone, where the design sees to it."""
     stated = bending(coil, frequency)
@@ -134,8 +134,7 @@ def test_a_measured_mode_keeps_its_margin_anywhere_within_its_spread(frequency, 
         assert LEAST["spread"].complaint(loop.margins(), 5000) == "", off
 
 
-@pytest.mark.parametrize("coil", [-0.1, 0.1])
-@pytest.mark.parametrize("frequency", [700.0, 1150.0])
+@pytest.mark.parametrize(("frequency", "coil"), [(700.0, -0.1), (1150.0, 0.1)])
 def test_beside_a_measured_mode_a_load_leaves_less_than_with_the_viscous_damper(frequency, coil):
     mode = bending(coil, frequency)
     model = replace(model_of(5000), bending=mode)
@@ -179,7 +178,7 @@ def test_it_is_off_where_the_mode_damps_itself(quality, on):
 def test_it_is_found_on_odd_plates_whatever_their_unit_of_mass(rng):
     """Peaks narrower than the design's steps of frequency included, whose normal equations nearly are singular."""
     rounding = np.finfo(float).eps / load_damper.RIDGE  # times the largest condition
-    for _ in range(20):
+    for _ in range(8):
         rate, ratio, mass = (10.0 ** rng.uniform(*each) for each in ((3.0, 5.0), (-4.0, -1.1), (-3.0, 0.0)))
         part = Oscillator(rate, 1, mass, 2 * np.pi * rng.uniform(20.0, min(400.0, rate / 5)), ratio, 0.7)
         taps = load_damper._chosen(part, None, 0, True)
@@ -188,7 +187,7 @@ def test_it_is_found_on_odd_plates_whatever_their_unit_of_mass(rng):
         np.testing.assert_allclose(heavy, 3.0 * taps, rtol=0.0, atol=rounding * abs(heavy).max())
 
 
-@pytest.mark.parametrize("frequency", [60.0, 150.0, 190.0])
+@pytest.mark.parametrize("frequency", [60.0, 190.0])
 def test_a_mode_below_the_usual_spread_is_taken(frequency):
     """Its spread is half its frequency then; rocking, into which it does not couple, keeps its damper."""
     model = PlateParameters(bending_frequency=frequency).device_model(5000.0, 1)
