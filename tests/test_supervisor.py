@@ -351,7 +351,7 @@ def test_a_press_makes_the_damper_ask_for_far_more_than_its_limit_for_a_moment_o
 
 @pytest.mark.parametrize("seed", [1000, 1003, 10041, 10099, 41691, 60266, 60789, 61279])
 def test_normal_scenes_are_not_stopped(seed):
-    """20 s each (`benchmarks/false_stops.py`: hours); the last ones slide at 4 and 5 N, tap with 4.4 N, or press 4.6 N within 3 ms."""
+    """20 s each (`benchmarks/false_stops.py`: hours); the last slide at 4 and 5 N, tap with 4.4, press 4.6 in 3 ms."""
     error, controller = run(*random_scene(seed))
     assert error is None
     assert controller.damper_scale == 1.0
