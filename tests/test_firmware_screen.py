@@ -6,14 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from board import RATE, SANITISED, SCENE, SLOW, BoardProcess, SlowClock, SteppedBoard, build_board, tones
+from board import RATE, SANITISED, SCENE, SteppedBoard, build_board, tones
 from laws import KINDS
-from test_board_live import wait_for
 
 import hapticrender as hr
 from hapticrender.bands import Bands, hold_last
 from hapticrender.drivers.protocol import Cause
-from hapticrender.drivers.serial import BoardTexture, SerialDriver
+from hapticrender.drivers.serial import BoardTexture
 from hapticrender.errors import DeviceFault
 from hapticrender.export import export
 from hapticrender.plants.sliding_contact import SlidingParameters
@@ -166,30 +165,6 @@ def test_it_is_at_rest_where_the_host_is_silent(program, tmp_path, library):
     assert [int(line[3]) for line in log if line[1:3] == ["state", "0"]][-1] == Cause.SILENCE
     (zero,) = [int(line[0]) for line in log if line[1:3] == ["drives", "0"]][-1:]
     assert 0.08 * RATE < zero - silent <= 0.09 * RATE + 2
-
-
-def test_a_screen_plays_live(program, tmp_path):
-    """Ridges, then a tone, under a finger of the application; at the end the carrier is at zero."""
-    with BoardProcess(program, tmp_path, *SLOW) as board:
-        driver = SerialDriver(str(board.port), clock=SlowClock())
-        tone, place = hr.Grating(frequency=80.0, amplitude=5e-6), -0.01
-        with hr.Player("electroadhesion", driver=driver, finger=FINGER, profile={"rate": RATE}) as player:
-            for texture, hertz, speed in ((RIDGES, 50.0, 0.05), (tone, 80.0, -0.05)):
-                player.play(texture)
-                start, began = driver.client.clock.monotonic(), place
-                while (slid := driver.client.clock.monotonic() - start) < 0.3:
-                    place = began + speed * slid
-                    player.finger(place, speed, 0.4)
-                    player.sleep(0.01)
-                [state] = player.state().bands
-                # v/F = 0.64 m/(N s)
-                assert state.target == pytest.approx(2 * np.pi * hertz * 5e-6 / 0.64 / np.sqrt(2), rel=0.05)
-                assert np.isnan(state.achieved)
-                player.finger(place, 0.0, 0.4)  # it rests while the next one is prepared
-                player.sleep(0.1)
-            # a host that pauses leaves the finger behind, which is then approached faster than it slides
-            assert player.state().flags & ~hr.Flag.SATURATED == hr.Flag(0)
-        wait_for(lambda: [line[2] for line in board.log() if line[1] == "drives"][-1] == "0")
 
 
 @pytest.mark.parametrize(

@@ -4,8 +4,10 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from board import SLOW, BoardProcess, SlowClock, build_board, sensed_error
+from board import RATE, SLOW, BoardProcess, SlowClock, build_board, sensed_error
 from live_devices import TONE
+from test_board_live import wait_for
+from test_firmware_screen import FINGER, RIDGES, SCREEN
 from waves import Own, phasor
 
 import hapticrender as hr
@@ -183,3 +185,28 @@ def test_the_board_stops_when_the_application_is_silent(program, tmp_path):
         assert [line[2:] for line in board.log() if line[1] == "state"][-2:] == [["1", "0"], ["0", "7"]]
     flags = Recording.load(tmp_path / "silent.au").flags
     assert (flags[:-1] & hr.Flag.STOPPED).any()  # of the board's fade; the last sample is the player's own
+
+
+def test_a_screen_plays_live(tmp_path):
+    """Ridges, then a tone, under a finger of the application; at the end the carrier is at zero."""
+    program = build_board(tmp_path / "screen", hr.prepare(SCREEN))
+    with BoardProcess(program, tmp_path, *SLOW) as board:
+        driver = SerialDriver(str(board.port), clock=SlowClock())
+        tone, place = hr.Grating(frequency=80.0, amplitude=5e-6), -0.01
+        with hr.Player("electroadhesion", driver=driver, finger=FINGER, profile={"rate": RATE}) as player:
+            for texture, hertz, speed in ((RIDGES, 50.0, 0.05), (tone, 80.0, -0.05)):
+                player.play(texture)
+                start, began = driver.client.clock.monotonic(), place
+                while (slid := driver.client.clock.monotonic() - start) < 0.3:
+                    place = began + speed * slid
+                    player.finger(place, speed, 0.4)
+                    player.sleep(0.01)
+                [state] = player.state().bands
+                # v/F = 0.64 m/(N s)
+                assert state.target == pytest.approx(2 * np.pi * hertz * 5e-6 / 0.64 / np.sqrt(2), rel=0.05)
+                assert np.isnan(state.achieved)
+                player.finger(place, 0.0, 0.4)  # it rests while the next one is prepared
+                player.sleep(0.1)
+            # a host that pauses leaves the finger behind, which is then approached faster than it slides
+            assert player.state().flags & ~hr.Flag.SATURATED == hr.Flag(0)
+        wait_for(lambda: [line[2] for line in board.log() if line[1] == "drives"][-1] == "0")

@@ -22,9 +22,9 @@ REST, ZERO = 0.13, 10e-3  # s
 FINGER = hr.Finger.sliding(speed=0.08, normal_load=0.4, span=0.18)
 TEXTURE = hr.Grating(frequency=100.0, velocity=10e-3)  # on a hybrid both parts play it
 KINDS = {
-    "electroadhesion": lambda block=10: Screen(blind=False, finger=FINGER, block=block),
+    "electroadhesion": lambda: Screen(blind=False, finger=FINGER, block=10),
     "ultrasonic": lambda: watched(FINGER),
-    "hybrid": lambda block=10: bench(block=block),
+    "hybrid": bench,
 }
 
 
