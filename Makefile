@@ -14,11 +14,10 @@ INSTALL := $(RUN) -m pip install --quiet --disable-pip-version-check --config-se
 OUT := out/demo
 OLDEST = $(shell sed -n 's/^dependencies = \[\(.*\)\]/\1/p' pyproject.toml | tr -d '",' | sed 's/>=/==/g')
 OLDEST_TESTS := $(addprefix tests/test_,$(addsuffix .py,math kernel blocks plate contact low_pass realtime))
-# Tests that play in real time run first, one after the other; the rest on two cores.  test_audio_verbs paces its card.
-# What fails of them is run once more, and that is said: a machine that has other work loses samples, and JACK now and
-# then a wake-up.
+# Tests that play in real time come last, when all is compiled and nothing else runs: a machine that has other work loses
+# samples, and JACK now and then a wake-up.  What fails of them is run once more, one after the other, and that is said.
 REAL_TIME := $(addprefix tests/test_,audio_friction.py audio_jack.py player_board.py player_clock.py player_foreseen.py board_live.py board_profile.py audio_carrier.py)
-IN_REAL_TIME := MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) -o cache_dir=build/real_time
+IN_REAL_TIME := MPLBACKEND=Agg $(RUN) -m pytest $(REAL_TIME) --dist loadfile -o cache_dir=build/real_time
 PACKAGES := jackd2 libportaudio2 libjack-jackd2-dev gcc libc6-dev make gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
 BOARD_TESTS := $(addprefix tests/test_,firmware_law.py firmware_screen.py firmware_m4.py export.py protocol.py serial_driver.py board_faults.py board_live.py board_profile.py board_textures.py \
 	nu32.py player_board.py)
@@ -33,12 +32,9 @@ demo: .venv/demo.stamp ## render the built-in scenes on simulated devices into o
 
 test: .venv/test.stamp ## run every test (PYTEST_ARGS="-m 'not slow'" leaves out the long ones)
 	@rm -rf build/real_time
-	@$(IN_REAL_TIME) $(PYTEST_ARGS) --maxfail=0 || case $$? in \
-		1) echo "repeated, as they failed in real time:"; \
-			$(IN_REAL_TIME) --last-failed --last-failed-no-failures none $(PYTEST_ARGS);; \
-		134) echo "begun anew, as PortAudio ended the process (docs/realtime.md):"; $(IN_REAL_TIME) $(PYTEST_ARGS);; \
-		*) false;; esac
 	@MPLBACKEND=Agg $(RUN) -m pytest -n 2 --dist worksteal $(addprefix --ignore=,$(REAL_TIME)) $(PYTEST_ARGS)
+	@$(IN_REAL_TIME) -n 2 $(PYTEST_ARGS) --maxfail=0 || { test $$? = 1 && echo "repeated, as they failed in real time:" \
+		&& $(IN_REAL_TIME) -n 1 --last-failed --last-failed-no-failures none $(PYTEST_ARGS); }
 
 # Tests of what is missing are skipped, and say so.
 packages: ## install what the tests of sound cards and boards need (on Debian and Ubuntu, as root)
