@@ -21,6 +21,7 @@ void supervisor_init(supervisor_t *supervisor, const supervision_t *used, const 
     supervisor->design = played;
     supervisor->sensed_bound = used->sensed_bound;
     supervisor->fade = REAL(1.0);
+    supervisor->away = played->loss_time + 2u; /* no contact yet */
 }
 
 static uint32_t counted(uint32_t count, uint32_t holds) { return (holds != 0u) ? (count + 1u) : 0u; }
@@ -212,10 +213,11 @@ static supervisor_cause_t check_motion(supervisor_t *s)
         }
     }
     judge_energies(s, &wrong, &active);
-    if ((danger != 0u) || (s->contact_count == 0u)) { /* a press that begins or ends is no fault */
-        const uint32_t more = (danger != 0u) ? 4u : 1u;
-        const uint32_t count = s->inconsistent_count;
-        s->inconsistent_count = (wrong != 0u) ? (count + more) : less_one(less_one(count));
+    wrong &= ((danger != 0u) || (s->contact_count == 0u)) ? 1u : 0u; /* a contact that begins or ends is no fault */
+    if (wrong != 0u) {
+        s->inconsistent_count += (danger != 0u) ? 4u : 1u;
+    } else {
+        s->inconsistent_count = less_one(less_one(s->inconsistent_count));
     }
     s->active_count = counted(s->active_count, active & danger);
     s->motion_count = counted(s->motion_count, (motion > p->most_motion) ? 1u : 0u);
@@ -383,6 +385,16 @@ static supervisor_cause_t check(supervisor_t *s, law_t *law, const real_t sensed
     return cause;
 }
 
+/* Count the time since a contact began or ended; a single position that is missing is no lift-off. */
+static void note_contact(supervisor_t *s, uint32_t touched)
+{
+    const uint32_t loss = (s->design->loss_time > 0u) ? s->design->loss_time : 1u;
+    const uint32_t away = (touched != 0u) ? 0u : ((s->away <= loss) ? (s->away + 1u) : s->away);
+    const uint32_t begins = ((away == 0u) && (s->away >= loss)) ? 1u : 0u;
+    s->contact_count = ((begins != 0u) || (away == loss)) ? s->p->drive_time : less_one(s->contact_count);
+    s->away = away;
+}
+
 uint32_t supervisor_step(
     supervisor_t *supervisor, law_t *law, const real_t sensed[], real_t position, real_t reference, real_t drive[])
 {
@@ -397,9 +409,7 @@ uint32_t supervisor_step(
         s->input[2u + i] = REAL(0.5) * (s->force[i] + s->forces[s->at][i]);
         s->force[i] = s->forces[s->at][i];
     }
-    const uint32_t touched = isfinite(position) ? 1u : 0u;
-    s->contact_count = (touched != s->touched) ? s->p->drive_time : less_one(s->contact_count);
-    s->touched = touched;
+    note_contact(s, isfinite(position) ? 1u : 0u);
     const supervisor_cause_t cause = check(s, law, sensed, drive);
     s->cause = (s->cause == SUPERVISOR_FINE) ? cause : s->cause;
     if (s->cause != SUPERVISOR_FINE) {

@@ -71,7 +71,7 @@ typedef struct {
     uint32_t inconsistent_count, active_count, drive_count, motion_count, ring_count, ring_wait_count, slow_count;
     uint32_t limit_count, contact_count;
     uint32_t kept, broken; /* samples; see is_broken */
-    uint32_t beyond_count, suspended, at, started, touched;
+    uint32_t beyond_count, suspended, at, started, away;
     uint32_t stopped_sensors; /* bit i: sensor i + 1, of an invalid, frozen, exceeding or wrong one; actuator */
     supervisor_cause_t cause;
 } supervisor_t;

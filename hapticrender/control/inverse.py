@@ -27,7 +27,7 @@ from hapticrender.control.inverse_records import (
 from hapticrender.control.load_damper import choose_load_damping
 from hapticrender.control.records import MOST_CHANNELS, aligned
 from hapticrender.control.supervisor import damper_settings
-from hapticrender.defaults import FADE_IN
+from hapticrender.defaults import FADE_IN, LOSS_TIME
 from hapticrender.mathx import foh
 from hapticrender.protocols import Array
 
@@ -41,7 +41,6 @@ FRICTION_REVERSION = 1.0  # 1/sqrt(s), of a finger's own friction, which stands 
 LEARNING_DELAY, RELEARNING_DELAY = 2e-3, 0.1  # s after a contact begins or ends: learning begins, and once more
 DAMPER_TIME, GATE_CLOSING = 0.1, 0.05  # s after it the damper's gate stays open; then it closes within
 INITIAL_TIME = 60e-3  # s, from the second start of learning on: the deviation at that start is a parameter
-LOSS_TIME = 1e-3  # s without a position, by which a contact is lost
 MODEL_ERROR = 0.1  # of what the drive explains of a deviation: part that no parameter explains
 INNOVATIONS = 10.0  # weight of their mean square, times MODEL_ERROR^2: a tenth; on friction devices 0, and dev's is 1
 LEAST_NOISE = 5e-5  # of the sensors' range

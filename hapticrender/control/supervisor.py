@@ -32,6 +32,7 @@ from hapticrender.control.supervisor_kernel import (
     SWAPPED,
     supervised_step,
 )
+from hapticrender.defaults import LOSS_TIME
 from hapticrender.jit import Addressed, CFunction
 from hapticrender.protocols import Array, Controller
 
@@ -161,7 +162,7 @@ class SupervisedController(Addressed):
         for name, value in settings.items():
             self.state["p"][name] = value
         self.state["fade"] = self.state["damper_scale"] = 1.0
-        self.state["last"], self.state["position"] = 0.0, math.nan
+        self.state["last"], self.state["away"] = 0.0, settings["loss_time"] + 1
         self.channels, self.sensors = int(settings["channels"]), int(settings["sensors"])
 
     def __getattr__(self, name: str) -> Any:
@@ -242,6 +243,7 @@ def design_supervisor(controller: Any, model: DeviceModel) -> dict[str, Any]:
         "frame": model.block,
         "delay": model.delay,
         "needs_contact": model.finger.needs_contact,
+        "loss_time": max(round(LOSS_TIME * rate), 1),
         "sensor_limit": model.sensed_limit,
         "most_drive": UNLIMITED,
         "coordinate_from_sensor": padded(model.coordinate_from_sensed, 2, MOST_SENSORS),

@@ -13,8 +13,8 @@ no  cause        condition                                                      
 2   frozen       a sensor repeats a value for 10 samples and 2 ms, and 5 times as long as ever
                  before (or 10 ms), while the drive moves; or the device's last block of samples,
                  for as many samples, and 2 ms, while the drive does not repeat itself            at once
-3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F; held for 60 ms     15 to 60 ms
-                 after a contact begins or ends, but in danger
+3   inconsistent E_r > finger + load + model + delay + noise, and E_r < 6 E_F; not within 60 ms   15 to 60 ms
+                 after a contact begins or ends, unless in danger
 4   active       -mean(r v) > 0.6 sqrt(E_F E_v), E_r < 6 E_F, in danger only                      5 ms
                  or > 0.65 sqrt(E_F E_v) in heave, E_r < 6 E_F, means over 0.2 s ("slowly")       0.3 s
                  or the inner damper asks for more than 2.5 times its limit, rms over 3 ms        15 ms
@@ -74,7 +74,7 @@ large_drive most_damping sensed_bound drive_limit heat_smoothing heat_gain slow_
 fade_out fade_now least_friction friction_smoothing
 """.split()
 _TIMES = (
-    "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow limit".split()
+    "invalid frozen inconsistent active drive ring ring_wait ring_stop suspension beyond slow limit loss".split()
 )  # samples
 SETTINGS = np.dtype(
     [
@@ -112,7 +112,10 @@ SUPERVISOR = np.dtype(
         *((name, np.int64, (MOST_SENSORS,)) for name in ("repeats", "longest", "frame_repeats")),
         *((f"{name}_count", np.int64) for name in COUNTS),
         *((name, np.int64) for name in ("kept", "broken")),  # samples; see `is_broken`
-        *((name, np.int64) for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count")),
+        *(
+            (name, np.int64)
+            for name in ("suspended", "sample", "now", "sensors", "cause", "stopped", "beyond_count", "away")
+        ),
         ("compared", np.int64),  # whether motion and drive were compared in the last sample
     ]
 )
@@ -278,9 +281,8 @@ def check_motion(supervisor):
         by_drive = residual < BY_DRIVE * drive
         wrong |= by_drive and residual > bound
         active |= by_drive and power > 0.0 and power * power > POWER * POWER * drive * e[2 + i]
-    if danger or s.contact_count == 0:  # a press that begins or ends is no fault
-        count = s.inconsistent_count
-        s.inconsistent_count = count + (4 if danger else 1) if wrong else max(count - 2, 0)
+    wrong &= danger or s.contact_count == 0  # a contact that begins or ends is no fault
+    s.inconsistent_count = s.inconsistent_count + (4 if danger else 1) if wrong else max(s.inconsistent_count - 2, 0)
     s.active_count = s.active_count + 1 if active and danger else 0
     s.motion_count = s.motion_count + 1 if s.motion > p.most_motion else 0
     if s.motion_count >= 5:
@@ -402,9 +404,11 @@ def supervise(supervisor, sensed, position, drive, flags, n):
     for i in range(2):
         s.input[2 + i], s.force[i] = 0.5 * (s.force[i] + forces[now, i]), forces[now, i]
     acts = p.needs_contact == 0 or (position[n] == position[n] and position[n] != s.position)
-    begins_or_ends = (position[n] == position[n]) != (s.position == s.position)
-    s.contact_count = p.drive_time if begins_or_ends else max(s.contact_count - 1, 0)
     s.position = position[n]
+    away = 0 if math.isfinite(position[n]) else min(s.away + 1, p.loss_time + 1)  # a single one missing is no lift-off
+    changes = away == p.loss_time or (away == 0 and s.away >= p.loss_time)
+    s.contact_count = p.drive_time if changes else max(s.contact_count - 1, 0)
+    s.away = away
     cause, invalid = check_sensors(supervisor, sensed, n, forces[now, 2], acts)
     if check_drive(supervisor, drive, n) and cause == 0:
         cause = DRIVE
