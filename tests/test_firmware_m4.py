@@ -36,7 +36,7 @@ def built(folder, rendering, target, *options):
 def m4_symbols(folder, *options):
     """Words that `nm` prints of every symbol of the portable objects in a folder: all that `make` builds."""
     cross_tools()
-    subprocess.run(["make", "-s", "-C", folder, f"CC={CROSS} {M4}", "OPTIMISE=-O1"], check=True)
+    subprocess.run(["make", "-s", "-C", folder, f"CC={CROSS} {M4}"], check=True)
     command = [CROSS.replace("gcc", "nm"), *options, *sorted(path.name for path in folder.glob("*.o"))]
     symbols = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
     return [line.split() for line in symbols.splitlines() if " " in line]

@@ -151,16 +151,10 @@ def on_a_strangers_screen(skin, mu, identified, finger):
     return error, recording.summary()["verdict"]
 
 
+@pytest.mark.parametrize("finger", FINGERS)
 @pytest.mark.parametrize(
-    ("skin", "mu", "identified", "finger"),
-    [
-        ("dry", 0.8, False, "usual"),
-        ("dry", 0.8, False, "heavy"),
-        ("normal", 0.84, False, "light"),
-        ("normal", 0.6, True, "usual"),
-        ("moist", 0.6, True, "light"),
-        ("moist", 0.6, True, "heavy"),
-    ],
+    ("skin", "mu", "identified"),
+    [("dry", 0.8, False), ("normal", 0.84, False), ("normal", 0.6, True), ("moist", 0.6, True)],
 )
 def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(skin, mu, identified, finger):
     """A design expects mu = 0.8 and a normal finger; a heavy finger that is dry is the worst."""
@@ -169,8 +163,9 @@ def test_white_noise_is_played_whole_on_a_screen_that_shares_no_code(skin, mu, i
     assert verdict == "passed"
 
 
-def test_a_moist_finger_fails_on_a_screen_that_shares_no_code_where_nothing_states_it():
-    error, verdict = on_a_strangers_screen("moist", 0.8, False, "light")
+@pytest.mark.parametrize("finger", FINGERS)
+def test_a_moist_finger_fails_on_a_screen_that_shares_no_code_where_nothing_states_it(finger):
+    error, verdict = on_a_strangers_screen("moist", 0.8, False, finger)
     assert error > 0.5
     assert verdict == "failed"
 
@@ -219,7 +214,7 @@ def friction_errors(device, recording, speed, load):
 
 @pytest.mark.parametrize(
     ("speed", "load", "block"),
-    [(0.04, 0.25, 48), (0.08, 0.4, 48), (0.12, 1.0, 4)],
+    [(0.04, 0.25, 16), (0.08, 0.4, 48), (0.12, 1.0, 4), (0.12, 1.0, 16)],
 )
 def test_white_noise_is_played_whole_on_a_resonator_that_shares_no_code(speed, load, block):
     """As identified.  Where its force per volt, 10 % less than by the design, is not, the error is larger."""
@@ -306,6 +301,7 @@ def test_a_signed_friction_sensor_is_no_worse_than_open_loop():
         true, asked = np.concatenate(screen.moved)[: len(recording), 0], recording.reference
         played, asked = (sosfiltfilt(band, each)[late] for each in (true, asked))
         errors.append(np.std(played - asked) / np.std(asked))
+    assert max(errors) < 0.02  # what the project has set itself
     assert errors[1] < errors[0] + 1e-4
 
 

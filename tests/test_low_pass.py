@@ -31,9 +31,9 @@ MANY = bands_of(np.linspace(20.0, 400.0, 19))  # more than a tile holds
 
 
 def signals(rng, count=COUNT):
-    """Noise, a finger that turns round, and lifts after 140 ms, and a waveform."""
+    """Noise, a finger that turns round, and lifts after 90 ms, and a waveform."""
     time = np.arange(count) / RATE
-    position = np.where((time > 0.14) & (time < 0.15), np.nan, 0.02 * np.sin(20 * time))
+    position = np.where((time > 0.09) & (time < 0.1), np.nan, 0.02 * np.sin(20 * time))
     return 1e-6 * rng.standard_normal((count, 2)), position, 1e-6 * np.sin(2 * np.pi * 61.0 * time)
 
 

@@ -108,12 +108,14 @@ def test_a_plate_that_the_application_has_opened_is_left_at_zero_drive_by_identi
     assert not plate.played[-1].any()
 
 
-def test_what_measures_is_ended_by_a_signal_at_zero_drive(tmp_path):
+@pytest.mark.parametrize(("verb", "name", "status"), [("identify", "TERM", 143), ("latency", "HUP", 129)])
+def test_what_measures_is_ended_by_a_signal_at_zero_drive(verb, name, status, tmp_path):
     """With the exit status that every verb has, also where the signal comes again while it closes the driver."""
     log = tmp_path / "played"
-    command = [sys.executable, "-m", "hapticrender", "identify", "--driver", f"test_signals:struck:TERM,TERM,{log}"]
-    ended = run(command, preexec_fn=partial(signal.signal, signal.SIGTERM, signal.SIG_DFL))
-    assert ended.returncode == 143, ended.stderr
+    command = [sys.executable, "-m", "hapticrender", verb, "--driver", f"test_signals:struck:{name},{name},{log}"]
+    default = partial(signal.signal, getattr(signal, f"SIG{name}"), signal.SIG_DFL)
+    ended = run(command, preexec_fn=default)
+    assert ended.returncode == status, ended.stderr
     drive = np.fromfile(log).reshape(-1, 25, 2)
     assert drive[:-1].any()
     assert not drive[-1].any()
