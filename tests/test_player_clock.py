@@ -303,7 +303,7 @@ def test_a_texture_that_is_slower_than_the_clock_is_named_and_the_device_closed(
     with nullcontext() if share == 0.3 else named as caught, hr.Player(driver=Closing(1e9, "")) as player:
         player.play(texture)
         texture.share, texture.live = share, True
-        player.sleep(2.0)
+        player.sleep(2.0 if share == 0.3 else 3.5)
         player.state()
     ready.set()
     assert closed == [0.0]
