@@ -187,15 +187,16 @@ def test_it_is_found_on_odd_plates_whatever_their_unit_of_mass(rng):
         np.testing.assert_allclose(heavy, 3.0 * taps, rtol=0.0, atol=rounding * abs(heavy).max())
 
 
-@pytest.mark.parametrize(("rate", "delay", "most"), [(5000, 3, 1.8), (48000, 64, 2.0), (5000, 25, 3.1)])
+@pytest.mark.parametrize(("rate", "delay", "most"), [(5000, 3, 1.8), (48000, 64, 2.0), (5000, 25, 3.0)])
 def test_a_stiff_finger_takes_some_of_the_margins(rate, delay, most):
-    """Ms by docs/theory.md, under 12 kN/m without mass or damping, of which the designs know nothing."""
-    model = expected_of(rate, delay)
+    """Ms by docs/theory.md, under 12 kN/m without mass or damping, which no design includes."""
+    model, found = expected_of(rate, delay), []
     for choose, (c, part) in itertools.product((choose_damping, choose_load_damping), enumerate(oscillators(model))):
         damping = choose(model)
         stiffer = np.sqrt(1.0 + 12e3 / (part.mass * part.omega**2))
         touched = part._replace(omega=stiffer * part.omega, ratio=part.ratio / stiffer)
-        assert 1.0 / DamperLoop(touched, damping.taps[c], None, c, damping.stride).margins().modulus < most
+        found.append(1.0 / DamperLoop(touched, damping.taps[c], None, c, damping.stride).margins().modulus)
+    assert max(found) == pytest.approx(most, abs=0.05)  # its last digit
 
 
 @pytest.mark.parametrize("frequency", [60.0, 190.0])

@@ -3,7 +3,7 @@
 The loop of a coordinate is ``L(z) = P(z) z^-delay sum_i c_i z^-i``, P its mode behind a zero-order hold, and beside it
 what a bending mode of the surface adds to what the sensors show (docs/theory.md, "Inner damper").  Left out are the
 coupling between coordinates and the finger: one of 12 kN/m takes Ms from 1.7 to 1.8 with a delay of 3 samples at 5 kHz,
-and to 3.1 in blocks of 25 (``tests/test_load_damper.py``).
+and to 3.0 in blocks of 25 (``tests/test_load_damper.py``).
 """
 
 import math
