@@ -31,6 +31,7 @@ from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import is_in_time, refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
+LOST = "which may be all that is wrong: free the computer, or take larger blocks"
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
@@ -136,12 +137,14 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
     at zero drive.
     """
     driver, total = rendering.driver, rendering.samples
-    recorder = recorder_of(rendering, journal, requested=rendering.requested)
+    recorder, lost = recorder_of(rendering, journal, requested=rendering.requested), 0
 
     def keep(*parts: Callable[[], dict[str, Any]]) -> None:
+        nonlocal lost
         with stopped_by_signal(wait=True):  # else what was played since the last call is lost
             for part in parts:
                 if len((signals := part())["flags"]):
+                    lost += int(np.count_nonzero(signals["flags"] & Flag.OVERRUN))
                     recorder.append(**signals)
 
     device = rendering.device
@@ -166,7 +169,7 @@ def run(rendering: Rendering, *, journal: str | Path | None = None, progress: Pr
         if fault := loop.fault():
             fault.recording = recorder.finish()
             raise fault
-        compared = differences(rendering, getattr(device, "learned", loop.controller))
+        compared = differences(rendering, getattr(device, "learned", loop.controller), lost)
     recording = recorder.finish()
     recording.least_scale = getattr(loop.controller, "least_scale", 1.0)
     recording.warnings = compared
@@ -211,8 +214,7 @@ def device_fault(rendering: Rendering, controller: Any, sample: int, flags: Arra
     text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
     time, lost = sample / rendering.driver.rate, int(np.count_nonzero(flags & Flag.OVERRUN))
     if lost:
-        cure = "which may be all that is wrong: free the computer, or take larger blocks"
-        text = f"{lost} of the {len(flags)} samples until then were lost, {cure}; found was: {text}"
+        text = f"{lost} of the {len(flags)} samples until then were lost, {LOST}; found was: {text}"
     return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 
 
@@ -452,8 +454,11 @@ def _joined(blocks: list[dict[str, Array]]) -> dict[str, Array]:
     return signals
 
 
-def differences(rendering: Rendering, controller: object) -> tuple[str, ...]:
-    """State where a device differs from its model, by what a controller, or its telemetry, has learned on it."""
+def differences(rendering: Rendering, controller: object, lost: int) -> tuple[str, ...]:
+    """State where a device differs from its model, by what a controller, or its telemetry, has learned on it.
+
+    `lost` samples were not played or not sensed, which a law in closed loop takes for a force.
+    """
     scale, mismatch = getattr(controller, "damper_scale", 1.0), getattr(controller, "mismatch", 0.0)
     source, messages = rendering.scene.source, []
     if scale < 1.0:
@@ -465,7 +470,9 @@ def differences(rendering: Rendering, controller: object) -> tuple[str, ...]:
         cure = "correct [device]"
         if rendering.scene.device == "vt-plate":
             cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
-        messages.append(f"the device differs from its model{f', profile {source}' if source else ''}: {adds}; {cure}")
+        first = f"{lost} samples were lost, {LOST}; found was: " if lost else ""
+        differs = f"the device differs from its model{f', profile {source}' if source else ''}"
+        messages.append(f"{first}{differs}: {adds}; {cure}")
     return tuple(messages)
 
 

@@ -265,7 +265,7 @@ class Player(Addressed):
 
     def _compare(self) -> tuple[str, ...]:
         loop = self._loop
-        return () if loop is None else differences(loop.rendering, getattr(loop, "learned", None))
+        return () if loop is None else differences(loop.rendering, getattr(loop, "learned", None), self._lost)
 
     def state(self) -> PlayerState:
         """Return what plays at the moment, and what became of it."""

@@ -39,7 +39,7 @@ def test_a_profile_that_the_board_contradicts_is_named_by_render_and_live(profil
             board.run(driver.client, 0.9)
             early = loop.learned.mismatch  # in less than a second little is learned
             board.run(driver.client, 0.6)
-            assert (early, len(differences(loop.rendering, loop.learned))) == (0.0, wrong)
+            assert (early, len(differences(loop.rendering, loop.learned, 0))) == (0.0, wrong)
             driver.client.finger(0.0, 0.0, 0.4)
             board.run(driver.client, 0.1)
             assert loop.learned.mismatch == 0.0  # it is touched

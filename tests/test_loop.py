@@ -39,6 +39,15 @@ class Blocks(SimulatedDriver):
         return super().play(drive)
 
 
+class Losing(Blocks):
+    """It loses its 2nd and its 100th block."""
+
+    def play(self, drive):
+        sensed = super().play(drive)
+        lost = len(self.played) in {2, 100}
+        return sensed._replace(flags=np.full(len(drive), int(hr.Flag.OVERRUN))) if lost else sensed
+
+
 def simulated(scene, seed=0, block=1, kind=SimulatedDriver, **overrides):
     return kind(Plate(PlateParameters(**overrides), scene.finger, seed, block))
 
@@ -182,8 +191,11 @@ def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
     stiff = {"stiffness_1": 1.05 * 22.4e3, "stiffness_2": 1.05 * 22.9e3}
     scene = scene_with(duration=3.0, profile=stiff)
     hr.render(scene)
-    with pytest.warns(hr.PlateMismatch, match=r"the controller adds \d"):
-        hr.render(scene_with(duration=3.0, simulation=stiff))
+    wrong = scene_with(duration=3.0, simulation=stiff)
+    with pytest.warns(hr.PlateMismatch, match=r"^the device differs.*the controller adds \d"):
+        hr.render(wrong)
+    with pytest.warns(hr.PlateMismatch, match="^14 samples were lost, which may be all .*the controller adds"):
+        hr.render(wrong, driver=simulated(wrong, kind=Losing, block=7, delay=7, **stiff))
     late = loop.prepare(scene_with(simulation={"delay": 5}))
     assert (late.plant.parameters.delay, late.model.delay) == (5, 1)
 

@@ -41,7 +41,7 @@ class UltrasonicParameters(Validated):
     [75.0, 250.1]
     """
 
-    frequency: float = parameter(30e3, "Hz", "undamped resonance of the free, cold plate", least=20e3, most=70e3)
+    frequency: float = parameter(30e3, "Hz", "undamped resonance of the free, cold plate", least=16e3, most=100e3)
     modal_mass: float = parameter(5e-3, "kg", "3e-3 to 8e-3 in the literature", above=0.0)
     quality: float = parameter(200.0, about="of the free plate: 100 to 400", least=5.0, most=1e5)
     finger_damping: float = parameter(11.0, "N s/m", "under 0.5 N, growing with the cube root of the load")
