@@ -1,4 +1,4 @@
-"""Every error that the library raises itself.
+"""Errors of the library: of designs, drivers and devices.  Those of one module (`MissingExtra`, `SweepError`) are there.
 
 Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add what a caller may want to catch by kind.
 """

@@ -147,7 +147,7 @@ class Plant(Protocol):
 
 @runtime_checkable
 class Controller(Protocol):
-    """Makes every band follow its target: estimator, law and synthesis over preallocated state.
+    """Makes the motion follow the texture, as a waveform or by bands, over preallocated state.
 
     `state` is the record that its compiled step reads and writes; a plant hands its address to the kernel in which the
     two are closed sample by sample.
@@ -236,7 +236,7 @@ class Method(Protocol):
     name: str
 
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> Controller:
-        """Validate, choose bandwidths, build tables; may raise `DesignError`.
+        """Validate, design the loop by the device model, build tables; may raise `DesignError`.
 
         Without `feedback` nothing is measured: the drive is computed from the device model alone.
         """

@@ -1,4 +1,4 @@
-"""What every control method promises, and where the plain ones stop: the figures of FACTS section 3 on this plate."""
+"""What every control method promises, and where the plain ones stop: figures on this plate (docs/theory.md, "Where methods fail")."""
 
 import dataclasses
 from dataclasses import replace
@@ -110,7 +110,7 @@ def test_without_sensors_it_drives_open_loop(name):
 @pytest.mark.parametrize(("gain", "holds"), [(15.0, True), (17.5, False)])
 @pytest.mark.parametrize("frequency", [(20.0,), (20.0, 31.0, 47.0, 72.0)], ids=["1 band", "4 bands"])
 def test_integrators_without_a_low_pass_take_the_damping_of_a_mode(gain, holds, frequency):
-    """FACTS 3: ki <= 15.  All bands together take away rocking's decay rate, zeta w = 0.01737 * 2 pi 147.27 1/s.
+    """ki <= 15.  All bands together take away rocking's decay rate, zeta w = 0.01737 * 2 pi 147.27 1/s.
 
     That is a limit of 16.07 1/s for carriers far below the mode; delay and hold, 0.3 ms, turn the force by 16 degrees
     and leave 3 % more.

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.timing import Absent
 from hapticrender.control.kernel import LEAK
-from hapticrender.control.records import INVERSE, SAMPLE_ROWS, W, aligned
+from hapticrender.control.records import SAMPLE_ROWS, TOEPLITZ, W, aligned
 from hapticrender.mathx import COS, SIN
 
 HERE = Path(__file__).parent
@@ -108,7 +108,7 @@ class TunedBlock:
             raise ValueError(f"block={self.block}: must be a multiple of {GROUP}, on two stepped channels")
         if max(state["fast_open"], state["slow_open"]) > 0.0 or not (tiles["wavenumber"] == 0.0).all():
             raise ValueError("carriers must be fixed, and the controller in quiet")
-        speak, q = p["drive_from_force"][:2], samples_of(controller)[INVERSE]
+        speak, q = p["drive_from_force"][:2], samples_of(controller)[TOEPLITZ]
         levels = np.array([*state["dc"], *state["dc_drift"]])
         self.arrays = [_bands(tiles), _loops(tiles), _laws(tiles), _held(tiles, speak)]
         self.arrays += [_phases(tiles, p["rate"], self.block)]

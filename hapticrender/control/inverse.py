@@ -18,7 +18,7 @@ from hapticrender.control.inverse_records import (
     FINGER,
     HEAVE,
     INITIAL,
-    INVERSE,
+    LAW,
     LOAD,
     PARAMETERS,
     RING,
@@ -151,8 +151,8 @@ class WaveformController(BankController):
 
     @property
     def law(self) -> Any:
-        """Settings and state of the law (a record, see `INVERSE`)."""
-        return self._arrays["loops"][0]
+        """Settings and state of the law (a record, see `LAW`)."""
+        return self._arrays["law"][0]
 
     @property
     def least_scale(self) -> float:
@@ -193,13 +193,13 @@ class AdaptiveInverse:
         if damping is not None and not (damping.on and quiet_enough(damping, model)):
             damping = None
         settings = controller_settings(model, bands, damping, feedback)
-        state = aligned(1, INVERSE)
+        state = aligned(1, LAW)
         rings = {"ring": np.zeros((model.delay + 1, RING)), "reference": np.zeros(model.delay)}
         for name, value in law_settings(model, bands, feedback).items():
             state[name] = value
         for name, array in rings.items():
             state[f"{name}_at"] = array.ctypes.data
-        memory = {"loops": state, **rings}
+        memory = {"law": state, **rings}
         return WaveformController(self.name, inverse_step, settings, bands, arrays=memory, lookahead=lookahead(model))
 
 
@@ -236,7 +236,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
 
 
 def law_times(model: DeviceModel, noise: float) -> dict[str, Any]:
-    """Fields of `INVERSE` that are times, in samples, or smoothing factors; `noise` (m rms) opens the damper's gate."""
+    """Fields of `LAW` that are times, in samples, or smoothing factors; `noise` (m rms) opens the damper's gate."""
     period, friction = 1.0 / model.rate, model.finger.contact is None
     return {
         "learning_delay": round(LEARNING_DELAY * model.rate),
@@ -273,7 +273,7 @@ def contact_length(model: DeviceModel) -> float:
 
 
 def law_settings(model: DeviceModel, bands: Bands, feedback: bool) -> dict[str, Any]:
-    """Fields of `INVERSE`."""
+    """Fields of `LAW`."""
     period, n = 1.0 / model.rate, len(model.mass)
     mean, covariance = prior(model)
     noise = np.sqrt((model.coordinate_from_sensed**2).sum(axis=1))

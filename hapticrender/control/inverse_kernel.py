@@ -34,7 +34,7 @@ from hapticrender.control.inverse_records import (
     COUPLING,
     FINGER,
     HEAVE,
-    INVERSE_T,
+    LAW_T,
     LOAD,
     PARAMETERS,
     RING,
@@ -42,12 +42,12 @@ from hapticrender.control.inverse_records import (
 )
 from hapticrender.control.kernel import sense_block, update_confidence
 from hapticrender.control.peak_limit import NONFINITE, SATURATED, drive_of, shape_noise
-from hapticrender.control.records import CONTROLLER_T, LOCKED, PAST, PAST_MASK, TILE_T, Y, samples_of
+from hapticrender.control.records import CONTROLLER_T, LOCKED, PAST, PAST_MASK, SUM, TILE_T, Y, samples_of
 from hapticrender.jit import F8, I8, SIGNALS_T, kernel, pointer, record, step
 from hapticrender.mathx import TURN, unit
 from hapticrender.vectors import get, put, real, total, zeros
 
-REFRESH = 25  # samples between two discretisations of the loaded device
+DISCRETISATION = 25  # samples between two discretisations of the loaded device
 REVERSION = 20  # samples between two steps of the parameters' reversion to their mean
 LARGEST_MOMENT = 1.0  # N, of the levelling: a hard press may tilt the device
 MOST_NEEDED = 20.0  # of the drive's limit; a reference that is scaled by more teaches nothing
@@ -55,7 +55,6 @@ HUGE = 1e6  # drive unit: no drive
 TINY = 1e-300  # m^2 or N^2: nothing was learned
 NOISE_SMOOTHING = 4e-3 / 0.3  # of the sensors' noise at the gate, over that of the mean square over 4 ms
 MOST_NOISE = 25.0  # of the sensors' stated one, as mean squares
-FORCE = Y  # rows of a sample's forces, once its measurements have been read
 SCALED = 0.999  # a reference scaled by less is saturated
 
 
@@ -74,9 +73,9 @@ def bands_ahead(controller, lead):
 
 
 @kernel
-def take_reference(controller, inverse, waveform):
+def take_reference(controller, law, waveform):
     """Put the reference of the look-ahead into the window; find what the sensors should show of it now."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     if c.p.reads_waveform > 0.0:
         if abs(waveform) <= c.p.sensor_limit:  # else it is held
             v.last_waveform = waveform
@@ -99,9 +98,9 @@ def take_reference(controller, inverse, waveform):
 
 
 @kernel
-def find_basis(controller, inverse):
+def find_basis(controller, law):
     """Basis of the forces at the moment at which this sample's drive acts: derivatives of r by the filters."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     window, filters, basis, poles, pair = v.window, v.filters, v.basis, v.poles, v.pole_step
     d0 = d1 = d2 = d3 = 0.0
     for i in range(TAPS):
@@ -123,14 +122,14 @@ def find_basis(controller, inverse):
 
 
 @kernel
-def open_gate(controller, inverse, deviation):
+def open_gate(controller, law, deviation):
     """Gain of the inner damper: open after a contact, and while the deviation is more than noise.
 
     The threshold is (2 sigma)^2 as stated, or four times the mean square of second differences over sqrt 6 (mean over
     0.3 s), at most 25 times as stated: a damper that a noisier sensor keeps open passes its noise on.
     `damper_scale` is the supervisor's: it turns a ringing damper down.  Returns whether a deviation opens the gate.
     """
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     v.slow += v.high_pass_smoothing * (deviation - v.slow)
     above = deviation - v.slow
     v.power += v.mean_square_smoothing * (above * above - v.power)
@@ -147,13 +146,13 @@ def open_gate(controller, inverse, deviation):
 
 
 @kernel
-def damp(controller, inverse, coordinate, deviation):
+def damp(controller, law, coordinate, deviation):
     """Force of the inner damper, F = -sum c_j dev[n - j s] within its limit; `damper_force` is before limit and gain.
 
     s is the distance of its taps in samples; `past` is a ring.
     """
     c = record(controller, CONTROLLER_T, 0)
-    now, force = record(inverse, INVERSE_T, 0).sample & PAST_MASK, 0.0
+    now, force = record(law, LAW_T, 0).sample & PAST_MASK, 0.0
     c.past[coordinate, now] = deviation
     if c.damping_gain > 0.0 or c.damper_scale < 1.0:
         for j in range(c.p.n_taps):
@@ -163,9 +162,9 @@ def damp(controller, inverse, coordinate, deviation):
 
 
 @kernel
-def learned_force(controller, inverse):
+def learned_force(controller, law):
     """What was learned of finger and device, less what the sensor's noise taught, as forces in heave and rocking."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     theta, basis = v.theta, v.basis
     finger = heave = rocking = 0.0
     for i in range(5):
@@ -179,9 +178,9 @@ def learned_force(controller, inverse):
 
 
 @kernel
-def update_powers(inverse, nominal, learned):
+def update_powers(law, nominal, learned):
     """Mean squares over a second of the free device's nominal force in heave, and of what was learned beside it."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     free = 1.0 - v.contact
     v.reference_power += v.power_smoothing * (free * v.reference * v.reference - v.reference_power)
     v.nominal_power += v.power_smoothing * (free * nominal * nominal - v.nominal_power)
@@ -189,21 +188,21 @@ def update_powers(inverse, nominal, learned):
 
 
 @kernel
-def levelling_force(inverse):
+def levelling_force(law):
     """Rocking force that slowly levels the device under the load: a moving finger would else tilt it to and fro."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     target = v.contact * min(max(v.lever * v.theta[LOAD] + v.theta[LOAD + 1], -LARGEST_MOMENT), LARGEST_MOMENT)
     v.moment += v.levelling_smoothing * (target - v.moment)
     return v.moment
 
 
 @kernel
-def scale_reference(inverse, needed):
+def scale_reference(law, needed):
     """Scale the reference so that the drive stays within its limit; `needed` is that of the whole reference, over it.
 
     The largest need is held for a while and then falls; two poles smooth the scale, so that it makes no edges.
     """
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     v.hold_left -= 1.0
     if needed >= 0.98 * v.peak:
         v.peak, v.hold_left = min(max(v.peak, needed), MOST_NEEDED), v.hold
@@ -215,12 +214,12 @@ def scale_reference(inverse, needed):
 
 
 @kernel
-def recover(controller, inverse):
+def recover(controller, law):
     """Start afresh from the prior, with nothing learned: a number got out of hand."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    reset_parameters(inverse, FINGER, PARAMETERS)
-    note_device(inverse)
-    note_device(inverse)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
+    reset_parameters(law, FINGER, PARAMETERS)
+    note_device(law)
+    note_device(law)
     v.moment = v.slow = v.power = v.nominal_power = v.learned_power = v.heave_power = v.heave_noise = v.peak = 0.0
     v.model_power[0] = v.model_power[1] = v.poles[0] = v.poles[1] = 0.0
     v.scale = v.smooth_scale = 1.0
@@ -230,23 +229,23 @@ def recover(controller, inverse):
         c.shaper[i, 0] = c.shaper[i, 1] = 0.0
         for j in range(PAST):
             c.past[i, j] = 0.0
-    discretise(controller, inverse)
+    discretise(controller, law)
 
 
 @kernel
-def play(controller, inverse, drive, flags, n, nominal0, nominal1):
+def play(controller, law, drive, flags, n, nominal0, nominal1):
     """Write the drive of a sample; what of it is not the nominal force goes into the ring with the basis."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     samples, limit, basis = samples_of(c), c.p.drive_limit, v.basis
     ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
     at = v.sample % (v.delay + 1)
     played0 = played1 = most = 0.0
     for i in range(c.p.channels):
-        exact = c.confidence * drive_of(c, samples, FORCE, 0, i)
+        exact = c.confidence * drive_of(c, samples, SUM, 0, i)
         if not abs(exact) < HUGE:
             exact = 0.0
             flags[n] |= NONFINITE
-            recover(controller, inverse)
+            recover(controller, law)
         most = max(most, abs(exact) / limit)
         if c.confidence == 0.0:
             c.shaper[0, i] = c.shaper[1, i] = exact = 0.0
@@ -258,7 +257,7 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
         played1 += v.force_from_drive[1, i] * value
     if most > 1.0 or v.smooth_scale < SCALED:
         flags[n] |= SATURATED
-    scale_reference(inverse, most / v.smooth_scale)
+    scale_reference(law, most / v.smooth_scale)
     for i in range(BASIS):
         ring[at, i] = basis[i]
     sane = abs(nominal0) + abs(nominal1) < HUGE
@@ -270,8 +269,8 @@ def play(controller, inverse, drive, flags, n, nominal0, nominal1):
 def inverse_step(state, signals, start, count):
     """Advance the waveform law by `count` samples; see `hapticrender.jit`."""
     c, io = record(state, CONTROLLER_T, 0), record(signals, SIGNALS_T, 0)
-    inverse, samples, stop = c.loops_at, samples_of(c), start + count
-    v = record(inverse, INVERSE_T, 0)
+    law, samples, stop = c.law_at, samples_of(c), start + count
+    v = record(law, LAW_T, 0)
     drive, flags = carray(pointer(io.drive, F8), (stop, c.p.channels)), carray(pointer(io.flags, I8), stop)
     position, waveform = carray(pointer(io.position, F8), stop), carray(pointer(io.waveform, F8), stop)
     for n in range(start, stop):
@@ -284,38 +283,38 @@ def inverse_step(state, signals, start, count):
             update_targets(c, io, n, 1)
         else:
             c.sample += 1
-        learning = follow_contact(state, inverse)
-        take_reference(state, inverse, waveform[n] if c.p.reads_waveform > 0.0 else 0.0)
-        error0, error1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
-        samples[FORCE, 0] = samples[FORCE + 1, 0] = 0.0  # the damper's, first
+        learning = follow_contact(state, law)
+        take_reference(state, law, waveform[n] if c.p.reads_waveform > 0.0 else 0.0)
+        dev0, dev1 = y0 - c.p.pattern[0] * v.reference, y1 - c.p.pattern[1] * v.reference
+        samples[SUM, 0] = samples[SUM + 1, 0] = 0.0  # of the forces: the damper's, first
         if update_confidence(c, implausible):
-            reset_parameters(inverse, FINGER, PARAMETERS)
+            reset_parameters(law, FINGER, PARAMETERS)
             c.past[0, v.sample & PAST_MASK] = c.past[1, v.sample & PAST_MASK] = 0.0
         elif v.learns > 0:
             if implausible > 0:  # the damper takes the last deviations: those of the samples before have to be in place
-                error0, error1 = c.past[0, (v.sample - 1) & PAST_MASK], c.past[1, (v.sample - 1) & PAST_MASK]
-            elif open_gate(state, inverse, error0) and v.since > v.initial_end and c.p.needs_contact == 0.0:
-                suspect_change(inverse)
+                dev0, dev1 = c.past[0, (v.sample - 1) & PAST_MASK], c.past[1, (v.sample - 1) & PAST_MASK]
+            elif open_gate(state, law, dev0) and v.since > v.initial_end and c.p.needs_contact == 0.0:
+                suspect_change(law)
             for i in range(c.p.coordinates):
-                error = error0 if i == 0 else error1
+                deviation = dev0 if i == 0 else dev1
                 if learning and implausible == 0:
-                    learn(inverse, i, error)
-                samples[FORCE + i, 0] = damp(state, inverse, i, error)
+                    learn(law, i, deviation)
+                samples[SUM + i, 0] = damp(state, law, i, deviation)
         if v.sample % REVERSION == 0:
-            revert(inverse)
-        if v.sample % REFRESH == 0:
-            discretise(state, inverse)
-        d1, d2 = find_basis(state, inverse)
+            revert(law)
+        if v.sample % DISCRETISATION == 0:
+            discretise(state, law)
+        d1, d2 = find_basis(state, law)
         s0, s1, d0 = c.p.pattern[0], c.p.pattern[1], v.basis[0]
         along = v.stiffness[0, 0] * d0 + v.damping[0, 0] * d1 + v.mass[0, 0] * d2
         across = v.stiffness[0, 1] * d0 + v.damping[0, 1] * d1 + v.mass[0, 1] * d2
         other = v.stiffness[1, 1] * d0 + v.damping[1, 1] * d1 + v.mass[1, 1] * d2
         nominal0, nominal1 = s0 * along + s1 * across, s0 * across + s1 * other
-        learned0, learned1 = learned_force(state, inverse)
-        update_powers(inverse, nominal0, learned0)
-        samples[FORCE, 0] += nominal0 + learned0
-        samples[FORCE + 1, 0] += nominal1 + learned1 + levelling_force(inverse)
-        play(state, inverse, drive, flags, n, nominal0, nominal1)
-        advance_regressors(state, inverse)
+        learned0, learned1 = learned_force(state, law)
+        update_powers(law, nominal0, learned0)
+        samples[SUM, 0] += nominal0 + learned0
+        samples[SUM + 1, 0] += nominal1 + learned1 + levelling_force(law)
+        play(state, law, drive, flags, n, nominal0, nominal1)
+        advance_regressors(state, law)
         v.sample += 1
     return 0

@@ -13,7 +13,7 @@ from hapticrender.control.inverse_records import (
     FINGER,
     HEAVE,
     INITIAL,
-    INVERSE_T,
+    LAW_T,
     LOAD,
     PARAMETERS,
     RING,
@@ -23,6 +23,7 @@ from hapticrender.control.records import CONTROLLER_T
 from hapticrender.jit import F8, kernel, pointer, record
 from hapticrender.mathx import TURN
 
+LOADED = 180.0  # Hz, E: of the finger's mass and damping in G, which is largest there, at a plate's resonance under it
 FARTHEST_LEVER = 2.0  # no surface is longer
 UNREPORTED = 15e3  # N/m, of the coupling, for a finger whose place is not known yet: 12 N s/m or 10 g, the prior's most
 
@@ -40,14 +41,14 @@ def coupled(value, change):
 
 
 @kernel
-def discretise(controller, inverse):
+def discretise(controller, law):
     """Exact step of the loaded device over a sample, from a series of ten terms; states are coordinates, velocities.
 
-    The finger counts by its mass and damping at 180 Hz, the device with what was learned of its heave and coupling:
+    The finger counts by its mass and damping at `LOADED`, the device with what was learned of its heave and coupling:
     springs and dampers at the two sides change rocking by as much as heave, and couple both by their difference.
     """
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
-    theta, w, period = v.theta, TURN * 180.0, 1.0 / c.p.rate
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
+    theta, w, period = v.theta, TURN * LOADED, 1.0 / c.p.rate
     turn, pole = w / v.omega_n, v.pole
     low = complex(pole * pole - w * w, 2.0 * v.pole_damping * pole * w)
     z = complex(theta[0] - theta[2] * turn * turn, theta[1] * turn)
@@ -108,9 +109,9 @@ def discretise(controller, inverse):
 
 
 @kernel
-def reset_parameters(inverse, first, last):
+def reset_parameters(law, first, last):
     """Set parameters back to their prior; nothing else is known of them."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     theta, covariance, prior_covariance, states = v.theta, v.covariance, v.prior_covariance, v.states
     for i in range(first, last):
         theta[i] = v.prior[i]
@@ -123,9 +124,9 @@ def reset_parameters(inverse, first, last):
 
 
 @kernel
-def note_device(inverse):
+def note_device(law):
     """Note the device's own parameters and their covariance, and keep the last note."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     theta, covariance, earlier = v.theta, v.covariance, v.earlier
     for i in range(7):
         for j in range(8):
@@ -134,11 +135,11 @@ def note_device(inverse):
 
 
 @kernel
-def restore_device(inverse):
+def restore_device(law):
     """Set the device's own parameters back to the earlier note: a contact is reported after it happened."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     theta, covariance, earlier = v.theta, v.covariance, v.earlier
-    reset_parameters(inverse, HEAVE, LOAD)
+    reset_parameters(law, HEAVE, LOAD)
     for i in range(7):
         theta[HEAVE + i] = earlier[0, 7, i]
         for j in range(7):
@@ -148,9 +149,9 @@ def restore_device(inverse):
 
 
 @kernel
-def restart_regressors(inverse):
+def restart_regressors(law):
     """Start the regressors from rest, with the deviation of now as four more parameters."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     theta, covariance, states = v.theta, v.covariance, v.states
     for k in range(4):
         for i in range(ROWS):
@@ -160,31 +161,31 @@ def restart_regressors(inverse):
 
 
 @kernel
-def restart(inverse):
+def restart(law):
     """Learn afresh from here on, with the deviation of now as four more parameters.
 
     Estimates of finger and load stay, with the prior's covariance: what the ringing of a contact taught through a model
     without the finger is not as certain as it seemed.  Those of the device return to what was noted before the contact.
     """
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     covariance = v.covariance
-    restore_device(inverse)
+    restore_device(law)
     for i in range(PARAMETERS):
         within = i < HEAVE or i >= LOAD
         for j in range(PARAMETERS):
             if within or j < HEAVE or j >= LOAD:
                 covariance[i, j] = v.prior_covariance[i, j]
-    restart_regressors(inverse)
+    restart_regressors(law)
 
 
 @kernel
-def suspect_change(inverse):
+def suspect_change(law):
     """Learn at once from a deviation that no report explains: a touch and a lift are reported late.
 
     An untouched device counts as touched in the middle, until the report is due; that the finger may be elsewhere makes
     the coupling and the moment uncertain.  Of a finger that may have left all of its estimate is uncertain alike.
     """
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     theta, covariance = v.theta, v.covariance
     for i in range(LOAD, PARAMETERS):
         for j in range(PARAMETERS):
@@ -199,16 +200,16 @@ def suspect_change(inverse):
         for i in range(COUPLING, LOAD):
             covariance[i, i] += UNREPORTED * UNREPORTED
         covariance[LOAD + 1, LOAD + 1] = v.prior_covariance[LOAD, LOAD]
-    restart_regressors(inverse)
+    restart_regressors(law)
 
 
 @kernel
-def follow_contact(controller, inverse):
+def follow_contact(controller, law):
     """Reset what belongs to a contact when one begins or ends, and learn afresh, once and when its ringing is over.
 
     Returns whether there is anything to learn from.
     """
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     if c.finger_seen > 0.0:
         v.lever = min(max(v.lever_per_metre * c.held_position, -FARTHEST_LEVER), FARTHEST_LEVER)
     v.since += 1.0
@@ -217,34 +218,34 @@ def follow_contact(controller, inverse):
     v.away = 0.0 if touching > 0.0 else v.away + 1.0
     if suspected and touching > 0.0:  # what was learned of the finger stays
         v.since, c.fast_timer = 0.0, v.damper_time
-        restore_device(inverse)
+        restore_device(law)
     if v.contact > 0.0 and v.away < (0.0 if suspected else v.loss_time):  # a position missing so short is no lift-off
         touching = 1.0
     if touching != v.contact:
         v.contact, v.since = touching, 0.0
-        reset_parameters(inverse, FINGER, HEAVE)
-        reset_parameters(inverse, LOAD, PARAMETERS)
+        reset_parameters(law, FINGER, HEAVE)
+        reset_parameters(law, LOAD, PARAMETERS)
         c.fast_timer = v.damper_time
-        discretise(controller, inverse)
+        discretise(controller, law)
     elif v.since == v.learning_delay or v.since == v.relearning_delay:
-        restart(inverse)
+        restart(law)
     elif v.since == v.initial_end:
-        reset_parameters(inverse, INITIAL, PARAMETERS)
+        reset_parameters(law, INITIAL, PARAMETERS)
     elif v.since > v.initial_end and v.sample % int(v.report_delay) == 0:
-        note_device(inverse)
+        note_device(law)
     return v.since >= v.learning_delay
 
 
 @kernel
-def learn(inverse, coordinate, error):
+def learn(law, coordinate, deviation):
     """Update the parameters by a sensed deviation from the reference: a scalar step of the Kalman filter."""
-    v = record(inverse, INVERSE_T, 0)
-    states, theta, covariance, p_psi = v.states, v.theta, v.covariance, v.inputs  # P psi in the scratch of `inputs`
+    v = record(law, LAW_T, 0)
+    states, theta, covariance, p_psi = v.states, v.theta, v.covariance, v.p_psi
     explained = states[coordinate, PARAMETERS]
-    innovation = error - explained
+    innovation = deviation - explained
     for i in range(PARAMETERS):
         innovation += states[coordinate, i] * theta[i]
-    square = explained * explained + v.deviations * error * error + v.innovations * innovation * innovation
+    square = explained * explained + v.deviations * deviation * deviation + v.innovations * innovation * innovation
     v.model_power[coordinate] += v.mean_square_smoothing * (square - v.model_power[coordinate])
     variance = v.noise[coordinate] + v.model_error * v.model_power[coordinate]
     heave = uncertain = 0.0
@@ -252,7 +253,7 @@ def learn(inverse, coordinate, error):
         found = 0.0
         for j in range(PARAMETERS):
             found += covariance[i, j] * states[coordinate, j]
-        p_psi[0, i] = found
+        p_psi[i] = found
         variance += found * states[coordinate, i]
         if HEAVE <= i < COUPLING:
             heave += theta[i] * states[coordinate, i]
@@ -260,16 +261,16 @@ def learn(inverse, coordinate, error):
     v.heave_power += v.power_smoothing * (heave * heave - v.heave_power)
     v.heave_noise += v.power_smoothing * (v.noise_share * uncertain - v.heave_noise)
     for i in range(PARAMETERS):
-        kalman_gain = p_psi[0, i] / variance
+        kalman_gain = p_psi[i] / variance
         theta[i] -= kalman_gain * innovation
         for j in range(PARAMETERS):
-            covariance[i, j] -= kalman_gain * p_psi[0, j]
+            covariance[i, j] -= kalman_gain * p_psi[j]
 
 
 @kernel
-def revert(inverse):
+def revert(law):
     """Move the parameters and their covariance a step back towards the prior."""
-    v = record(inverse, INVERSE_T, 0)
+    v = record(law, LAW_T, 0)
     factor, theta, covariance, prior_covariance = v.reversion_factor, v.theta, v.covariance, v.prior_covariance
     for i in range(PARAMETERS):
         theta[i] = v.prior[i] + factor[i] * (theta[i] - v.prior[i])
@@ -279,9 +280,9 @@ def revert(inverse):
 
 
 @kernel
-def advance_regressors(controller, inverse):
+def advance_regressors(controller, law):
     """Advance the regressors by a sample, under the basis and the deviation force that act in it."""
-    c, v = record(controller, CONTROLLER_T, 0), record(inverse, INVERSE_T, 0)
+    c, v = record(controller, CONTROLLER_T, 0), record(law, LAW_T, 0)
     states, moved, inputs, phi = v.states, v.moved, v.inputs, v.step
     ring = carray(pointer(v.ring_at, F8), (v.delay + 1, RING))
     at = (v.sample + 1) % (v.delay + 1)  # what was computed `delay` samples ago

@@ -31,7 +31,7 @@ fade peak hold_left scale smooth_scale least_scale lever contact since away slow
 nominal_power learned_power reference_power last_waveform heave_power heave_noise
 """
 
-INVERSE = np.dtype(
+LAW = np.dtype(
     [
         # settings
         *((name, np.int64) for name in ("delay", "spatial", "learns")),
@@ -63,10 +63,11 @@ INVERSE = np.dtype(
         ("earlier", np.float64, (2, 8, 7)),  # the device's own parameters and covariance, 10-20 ms and 0-10 ms ago
         ("states", np.float64, (4, ROWS)),
         ("moved", np.float64, (4, ROWS)),  # states a sample later
+        ("p_psi", np.float64, (ROWS - 1,)),  # P psi of a coordinate
         ("inputs", np.float64, (2, ROWS)),
         # [A, B] T, a term of its series and the next one, [Phi, Gamma]
         *((name, np.float64, (4, 6)) for name in ("flow", "power_of_flow", "following", "step")),
     ]
 )
 """Settings and state of the waveform law beside those of the controller."""
-INVERSE_T = numba.from_dtype(INVERSE)
+LAW_T = numba.from_dtype(LAW)

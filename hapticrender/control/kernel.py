@@ -29,7 +29,6 @@ from hapticrender.control.records import (
     ANALYSIS,
     CONTROLLER_T,
     COORDINATE_T,
-    INVERSE,
     LEAK,
     PAST,
     PAST_MASK,
@@ -37,6 +36,7 @@ from hapticrender.control.records import (
     STEP,
     SUM,
     TILE_T,
+    TOEPLITZ,
     WAVEFORM,
     WORK_T,
     Y,
@@ -178,7 +178,7 @@ def innovate_block(c):
             samples[Y + i, m] -= samples[SUM + i, m] + c.dc[i] + m * c.dc_drift[i]
             if samples[Y + i, m] != samples[Y + i, m]:  # invalid: hold the prediction
                 samples[Y + i, m] = 0.0
-        solve(c, Y + i, INVERSE)
+        solve(c, Y + i, TOEPLITZ)
         gained = steeper = 0.0
         for m in range(block):
             gained += (c.dc_gain + (block - 1 - m) * c.dc_drift_gain) * samples[Y + i, m]

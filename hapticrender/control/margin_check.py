@@ -93,7 +93,7 @@ def checked_settings(
     *,
     wavenumber: Array | None = None,
     taps: Array | None = None,
-    least: LeastMargins = LEAST["law"],
+    least: LeastMargins = LEAST["bands"],
 ) -> Settings:
     """Lower the bandwidth until the margins on the free device hold at every level of the gain schedule.
 

@@ -80,7 +80,7 @@ class LeastMargins:
 
 
 LEAST = {
-    "law": LeastMargins(modulus=0.29, gain=1.4),  # bands share one residual: 20 Hz apart they leave 0.30 and 1.42
+    "bands": LeastMargins(modulus=0.29, gain=1.4),  # bands share one residual: 20 Hz apart they leave 0.30 and 1.42
     "damper": LeastMargins(modulus=1 / 1.7, gain=2.5, phase=math.radians(60.0)),
     "spread": LeastMargins(modulus=0.2, delay=0.0, phase=0.0, gain=1.0),
 }

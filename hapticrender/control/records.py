@@ -115,7 +115,7 @@ load lever contact law_contact law_lever finger_mass finger_damping finger_stiff
 fast_timer slow_timer fast_open slow_open peak_squared scale confidence shift unlocked response_gain
 gain damping_gain damper_scale dc_gain dc_drift_gain feedback_off
 """.split()
-_ARRAYS = "tiles loops commands setpoints work table phasors samples window gains references"
+_ARRAYS = "tiles loops law commands setpoints work table phasors samples window gains references"
 CONTROLLER = np.dtype(
     [
         ("p", SETTINGS),
@@ -137,7 +137,7 @@ COORDINATES_AT, STIFFNESSES_AT = (TILE.fields[name][1] for name in ("e0_re", "d0
 # rows of the samples' work array (rows, M): coordinates, then innovations; sums over the bands and their steps; finger
 # position; waveform; response r, first columns of Q for the innovation and for the waveform; what was solved; sums and
 # differences of samples at equal distances from a group's middle
-Y, SUM, STEP, POSITION, WAVEFORM, RESPONSE, INVERSE, ANALYSIS, SOLVED, FOLDED = 0, 2, 4, 6, 7, 8, 9, 10, 11, 12
+Y, SUM, STEP, POSITION, WAVEFORM, RESPONSE, TOEPLITZ, ANALYSIS, SOLVED, FOLDED = 0, 2, 4, 6, 7, 8, 9, 10, 11, 12
 SAMPLE_ROWS = 14
 
 

@@ -15,7 +15,7 @@ from hapticrender.control.carriers import FRESH_TIME
 from hapticrender.control.combined import CombinedController
 from hapticrender.control.gain_faults import GAINS
 from hapticrender.control.inverse import WaveformController
-from hapticrender.control.inverse_records import INVERSE, INVERSE_T, RING
+from hapticrender.control.inverse_records import LAW, LAW_T, RING
 from hapticrender.control.records import CONTROLLER, CONTROLLER_T
 from hapticrender.control.supervisor import SupervisedController
 from hapticrender.control.supervisor_kernel import SUPERVISOR
@@ -65,7 +65,7 @@ def state_table(controller: Any) -> Array:
 def settle_damper(controller, sensed):
     """Let what is `sensed` (an address) be no step to the inner damper of a waveform law that comes in."""
     c = record(controller, CONTROLLER_T, 0)
-    v, values = record(c.loops_at, INVERSE_T, 0), carray(pointer(sensed, F8), c.p.sensors)
+    v, values = record(c.law_at, LAW_T, 0), carray(pointer(sensed, F8), c.p.sensors)
     for i in range(c.p.coordinates):
         sag = 0.0
         for j in range(c.p.sensors):
@@ -135,8 +135,8 @@ def _blocks(part: Any) -> dict[str, Block]:
         return found | {"finger": _fields(at, CONTROLLER, "fresh", "past")}  # and the rounding
     # the same fields, which mean other things there, and what the damper remembers
     found |= {"contact": _fields(at, CONTROLLER, "fresh", "sample")}
-    law, at, delay = part.law, int(state["loops_at"][0]), int(part.law["delay"])
-    found |= {"learned": _fields(at, INVERSE, "peak", "ring_at"), "window": _fields(at, INVERSE, "window")}
+    law, at, delay = part.law, int(state["law_at"][0]), int(part.law["delay"])
+    found |= {"learned": _fields(at, LAW, "peak", "ring_at"), "window": _fields(at, LAW, "window")}
     return found | {"ring": (int(law["ring_at"]), RING * (delay + 1)), "reference": (int(law["reference_at"]), delay)}
 
 

@@ -14,7 +14,6 @@ from hapticrender.control.carriers import FASTEST
 from hapticrender.control.records import (
     ANALYSIS,
     FOLDED,
-    INVERSE,
     LOCKED,
     PAIR_T,
     POSITION,
@@ -22,6 +21,7 @@ from hapticrender.control.records import (
     SOLVED,
     SUM,
     TILE_T,
+    TOEPLITZ,
     WORK_T,
     samples_of,
 )
@@ -151,8 +151,8 @@ def invert(c, g):
     sum_bands(c, 1, False)
     for m in range(block):
         samples[RESPONSE, m] = samples[SUM, m]
-    for row in range(INVERSE, ANALYSIS + 1):
-        gain, dc, drift = (g, p.dc, p.dc_drift) if row == INVERSE else (p.waveform_gain, 0.0, 0.0)
+    for row in range(TOEPLITZ, ANALYSIS + 1):
+        gain, dc, drift = (g, p.dc, p.dc_drift) if row == TOEPLITZ else (p.waveform_gain, 0.0, 0.0)
         for m in range(block):
             samples[row, m] = 1.0 if m == 0 else 0.0
         for j in range(block):

@@ -23,10 +23,11 @@ no  cause        condition                                                      
 7   overmotion   motion of an end > 3 R + 5.4 sag                                                 5 samples
 8   beyond       a sensor shows more than the device's limit of displacement                      3 in 10 ms
 9   sensor gain  a sensor shows -1.6 to -0.4, -0.25 to 0.25, or more than 2 times the motion that
-                 device and drive give; see `gain_faults`                                               3 ms
-10  actuator ... its gain: an actuator gives -1.6 to -0.4 times its force; see `gain_faults`            5 ms and more
-11  swapped      two sensors show each other's motion, or two actuators give each other's force;   3 ms; actuators
-                 see `gain_faults`                                                                      5 ms and more
+                 device and drive give; see `gain_faults`                                         3 ms
+10  actuator     its gain: an actuator gives -1.6 to -0.4 times its force; see `gain_faults`      5 ms and more
+    gain
+11  swapped      two sensors show each other's motion, or two actuators give each other's force;  3 ms; actuators
+                 see `gain_faults`                                                                5 ms and more
 12  jump         a tribometer shows a friction that changes by half within one sample and by less
                  than a quarter of that in the samples before and after                           at once
 === ============ ================================================================================ ====================
