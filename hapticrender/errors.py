@@ -1,4 +1,4 @@
-"""Errors of the library: of designs, drivers and devices.  Those of one module (`MissingExtra`, `SweepError`) are there.
+"""Errors of designs, drivers and devices; those of one module alone (`MissingExtra`, `SweepError`) are there.
 
 Bad arguments are plain ``ValueError`` and ``TypeError``; the classes here add what a caller may want to catch by kind.
 """

@@ -26,12 +26,12 @@ CHANGE = 20e-3  # s: of a change of gain, amplitude or carrier
 MEASURING, MEASURING_DC = 10.0, 6.0  # Hz: widest bandwidth of the measured envelopes and of their offset
 GENERATED = "/* Written by `hapticrender export`; export the scene again instead of editing. */\n"
 BYTES = {"BANDS": 156, "DELAY": 48, "DAMPER_TAPS": 8, "PAST": 16, "SENSORS": 32, "CHANNELS": 4136}  # of board_t, each
-OTHER_BYTES = 12_524  # of the rest, with the textures' own
+OTHER_BYTES = 12_520  # of the rest, with the textures' own
 HUGE = 1e30  # a bound that is none, in float32 too
 SUFFIXES = (".c", ".h", ".ld", "Makefile")  # of the portable sources
 
 _CONTROLLER = """
-drive_limit drive_step sensor_limit lowest highest highest_edge coordinate_from_sensor drive_from_force pattern
+drive_limit drive_step sensor_limit highest highest_edge coordinate_from_sensor drive_from_force pattern
 damper_high damper_limit release
 """.split()
 _LAW = """

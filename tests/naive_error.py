@@ -138,7 +138,9 @@ class NaiveError:
         rises = slides | ((self.wavenumber == 0) & (not p["needs_contact"]))
         self.fade = np.clip(self.fade + np.where(rises, 1, -1) * p["fade_in"], 0.0, 1.0)
         f, edge, follows = abs(self.w) / TURN, p["highest_edge"], self.wavenumber > 0
-        grown = smooth(self.fade) * np.where(follows, smooth(2 * f / p["lowest"] - 1), 1.0)
+        grown = smooth(self.fade)
+        if p["lowest"] > 0:
+            grown = grown * np.where(follows, smooth(2 * f / p["lowest"] - 1), 1.0)
         self.weight = grown * np.where(follows, smooth((edge - f / p["highest"]) / (edge - 1)), 1.0)
         heard = np.where(follows, smooth(4 * (edge - f / p["highest"])), 1.0)
         self.share = np.minimum(grown * heard / np.maximum(self.fade, 1e-9), 1.0)

@@ -21,7 +21,7 @@ from hapticrender.renderers.hybrid import HybridSettings
 RATE = 10_000
 SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 START = 100.0 / 1.5  # Hz, F of the default crossover
-FELT = 0.01  # a tenth of what lies below every just noticeable difference (docs/theory.md, "Perception"), as the accuracy suite asks
+FELT = 0.01  # a tenth of the least noticeable difference (docs/theory.md, "Perception"), as in the accuracy suite
 
 
 def scene(texture, finger=SLIDE, duration=1.2, **plant):

@@ -1,4 +1,4 @@
-"""What every control method promises, and where the plain ones stop: figures on this plate (docs/theory.md, "Where methods fail")."""
+"""What every control method promises, and where the plain ones stop (docs/theory.md, "Where methods fail")."""
 
 import dataclasses
 from dataclasses import replace

@@ -129,8 +129,7 @@ static real_t fade_band(band_state_t *band, const law_t *law)
     band->sweep = TURN * law->finger.acceleration * band->now.wavenumber;
     band->fade = real_clip(
         band->fade + ((law->finger.seen != 0u) ? d->fade_step : -d->fade_step), REAL(0.0), REAL(1.0));
-    return smooth(band->fade) * smooth(REAL(2.0) * real_abs(hertz) / d->lowest - REAL(1.0))
-        * smooth(left / (d->highest_edge - REAL(1.0)));
+    return smooth(band->fade) * smooth(left / (d->highest_edge - REAL(1.0)));
 }
 
 void bands_advance(law_t *law)

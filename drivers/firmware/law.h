@@ -57,7 +57,7 @@ typedef struct {
     real_t drive_limit;  /* A, of each channel */
     real_t drive_step;   /* A, resolution of the drive; 0: ideal */
     real_t sensor_limit; /* m, of each sensor; a larger sample is a fault */
-    real_t lowest, highest, highest_edge; /* Hz, Hz, 1: where bands that follow the finger fade out */
+    real_t highest, highest_edge; /* Hz, 1: where bands that follow the finger fade out */
     real_t measuring, measuring_dc;       /* gains of the observer of law_measured */
     band_t bands[LAW_BANDS];              /* those of the scene */
     /* device */

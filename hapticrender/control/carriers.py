@@ -129,7 +129,8 @@ def fade_locked(c, t):
     """Update frequency, sweep and weights of a tile whose carriers follow the finger, and what its sensor shows.
 
     A target fades in with contact (and with speed, where friction needs it), and out towards the ends of the device's
-    range; the feedback's weight stays until the last quadrature of it.
+    range (the waveform law has no `lowest`, as a step of the target would be a kick); the feedback's weight stays until
+    the last quadrature of it.
     """
     b, p = record(c.tiles_at, TILE_T, t), c.p
     step, always = p.fade_in * p.block, p.needs_contact == 0.0
@@ -142,7 +143,9 @@ def fade_locked(c, t):
     fade = get(b, "fade") + where(follows, step if touching else -step, step if touching or always else -step)
     fade = minimum(maximum(fade, 0.0), 1.0)
     left = p.highest_edge - hertz * (1.0 / p.highest)
-    weight = active * smooth(fade) * where(follows, smooth(2.0 * hertz * (1.0 / p.lowest) - 1.0), 1.0)
+    weight = active * smooth(fade)
+    if p.lowest > 0.0:
+        weight = weight * where(follows, smooth(2.0 * hertz * (1.0 / p.lowest) - 1.0), 1.0)
     put(b, "fade", fade)
     put(b, "weight", weight * where(follows, smooth(left / (p.highest_edge - 1.0)), 1.0))
     put(b, "feedback", minimum(weight * where(follows, smooth(4.0 * left), 1.0) / maximum(fade, 1e-9), 1.0))

@@ -32,7 +32,6 @@ from hapticrender.mathx import foh
 from hapticrender.protocols import Array
 
 HIGHEST = 0.2  # of the rate: up to here the derivatives' filters are good to 5e-5
-LOWEST = 1e-3  # Hz: a carrier that follows a finger fades out below it
 OMEGA_N = 2 * math.pi * 200.0  # rad/s: derivatives are divided by its powers, so that parameters are in N/m
 POLE, POLE_DAMPING = 2 * math.pi * 200.0, 0.8  # the finger's pair of poles
 FINGERS, SEED = 300, 1  # fingers of the prior, and the seed that draws them
@@ -226,7 +225,7 @@ def controller_settings(model: DeviceModel, bands: Bands, damping: Damping | Non
         "typical_speed": model.typical_speed,
         "fade_in": period / FADE_IN,
         "highest_edge": model.highest_edge,
-        "lowest": LOWEST,
+        "lowest": 0.0,
         "drive_step": model.drive_step,
         "damper_high": 1.0 if damping else 0.0,
         "damper_limit": DAMPER_LIMIT,
