@@ -11,7 +11,7 @@ from strangers_plate import StrangersPlate
 
 import hapticrender as hr
 from benchmarks import faults
-from benchmarks.false_stops import Hidden, random_scene, run
+from benchmarks.false_stops import Hidden, random_scene, run, strangers_plate
 from hapticrender.control import inverse, probe, supervisor
 from hapticrender.control.gain_faults import WANDER, design_gains
 from hapticrender.control.probe import judge, probe_drive, probe_plate
@@ -224,7 +224,7 @@ def test_what_is_swapped_stops_the_drive_and_is_named(frequency, position, senso
 
 @pytest.mark.parametrize(("position", "limits"), [(0.05, {}), (-0.05, {"peak_drive": 0.65})], ids=["free", "limited"])
 def test_a_finger_near_an_end_is_no_swap_of_coils(position, limits):
-    """On the stranger's plate: the drive bears the finger's moment, which makes eta = 0.6, of 0.75; 0.8 A unlimited."""
+    """On the stranger's plate: the drive bears the finger's moment, which makes eta = 0.6, of 0.8; 0.8 A unlimited."""
     plate = faults.FaultyWrongPlate(*faults.FAULTS["none"], 2.0, position)
     recording = hr.render(scene(400.0, limits=limits), driver=plate)
     assert not (recording.flags & hr.Flag.STOPPED).any()
@@ -355,6 +355,11 @@ def test_normal_scenes_are_not_stopped(seed):
     error, controller = run(*random_scene(seed))
     assert error is None
     assert controller.damper_scale == 1.0
+
+
+def test_a_tap_while_the_drive_is_at_its_limit_is_no_swap_of_coils():
+    """1.35 N, 46 mm off the middle of the stranger's plate, and 268 um of 400 Hz: eta falls from 1.1 to 0.7."""
+    assert run(*random_scene(70013, 3.0, strangers_plate))[0] is None
 
 
 @pytest.mark.parametrize("size", [1, 25])

@@ -13,7 +13,7 @@
 #define RESPONSE 2u
 #define LEAST_INVERTED REAL(-1.6) /* gains of a sensor or an actuator that is inverted */
 #define MOST_INVERTED REAL(-0.4)
-#define LEAST_SWAPPED REAL(0.75) /* eta; less: a drive that bears more than 2/3 of the moment of a finger */
+#define LEAST_SWAPPED REAL(0.8) /* eta; less: a drive that bears more than 0.62 of the moment of a finger */
 #define MOST_SWAPPED REAL(1.4)
 #define DEAD REAL(0.25) /* of a sensor: a smaller magnitude is a fault, and a larger gain than this: */
 #define MOST_GAIN REAL(2.0)
