@@ -1,5 +1,6 @@
 """Electroadhesion end to end: tones on the tribometer, without a force sensor, and as a carrier in a file; refusals."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -38,6 +39,22 @@ def test_a_friction_coefficient_other_than_assumed_is_corrected():
     screen = Screen(blind=False, block=10, friction_coefficient=0.5)
     recording = hr.render(tone(100.0, duration=1.0, finger=SLIDE), driver=screen)
     assert band(recording)["rms_error_friction"] < NOISE
+
+
+@pytest.mark.parametrize("frequency", [100.0, 110.0, 125.0, 250.0])
+def test_a_running_mean_over_whole_periods_removes_the_mean_friction(frequency):
+    """0.8 N of it, which a mean over 50 ms reads as 46 mN at 110 Hz: more than the target of 10 mN, so no drive."""
+    scene = tone(frequency, force=0.01, duration=1.0)
+    recording = hr.render(replace(scene, method="boxcar"))
+    assert band(recording)["rms_error_friction"] < 0.01
+    assert recording.drive[RATE // 2 :].any()
+
+
+@pytest.mark.parametrize(("frequency", "played"), [(110.0, False), (140.0, True)])
+def test_a_low_pass_plays_nothing_where_the_mean_friction_hides_the_target(frequency, played):
+    """2 F_0 (f_L/f)^2 of 0.82 N is above a target of 10 mN up to 128 Hz."""
+    recording = hr.render(replace(tone(frequency, force=0.01, duration=1.0), method="paper"))
+    assert recording.drive[RATE // 2 :].any() == played
 
 
 def untold(sample, sensed):

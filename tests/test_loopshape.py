@@ -156,3 +156,19 @@ def test_the_delay_that_a_refusal_states_is_accepted_and_a_hundredth_more_is_not
     assert _widest(lowest, stated)[0] >= 0.05 * lowest / 4
     with pytest.raises(DesignError):
         _widest(lowest, 1.011 * stated)
+
+
+@pytest.mark.parametrize(
+    ("frequency", "periods"), [(12.0, 1), (20.0, 1), (39.0, 1), (47.0, 2), (105.0, 5), (110.0, 5), (250.0, 12)]
+)
+def test_a_running_mean_has_whole_periods_of_the_lowest_fixed_carrier(frequency, periods):
+    """As many as a period of 20 Hz has, beside carriers that follow the finger, too; the loop stays that of 20 Hz."""
+    model = PlateParameters().device_model(RATE, 1)
+    for wavenumber in ([0.0, 0.0], [0.0, 1000.0]):
+        bands = Bands(frequency=[frequency, 2 * frequency * (wavenumber[1] == 0.0)], wavenumber=wavenumber,
+                      phase=[0.0, 0.0], envelope=[1e-6, 1e-6])  # fmt: skip
+        settings, width = envelope_loop(model, bands, boxcar=True)
+        assert settings["window"] == round(periods * RATE / frequency)
+        assert width == min(frequency, 20.0) / 4
+    alone = Bands(frequency=[0.0], wavenumber=[1000.0], phase=[0.0], envelope=[1e-6])
+    assert envelope_loop(model, alone, boxcar=True)[0]["window"] == 250

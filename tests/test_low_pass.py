@@ -105,6 +105,25 @@ def test_complex_methods_modulate_and_differentiate_targets_and_polar_ones_refus
             METHODS[name].design(MODEL, bands)
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_a_gradient_is_refused_by_methods_that_move_the_surface_as_a_whole(name):
+    model = dataclasses.replace(MODEL, shape=(1.0, 0.3))
+    if name in LOW_PASS:
+        METHODS[name].design(MODEL, MIXED)
+        with pytest.raises(hr.DesignError, match="gradient: must be 0 1/m, .*: use 'inverse', 'h2' or 'h'"):
+            METHODS[name].design(model, MIXED)
+    else:
+        METHODS[name].design(model, MIXED)
+
+
+@pytest.mark.parametrize("name", ["paper", "paper-common", "boxcar"])
+def test_a_whole_waveform_is_refused_with_the_method_that_plays_it_on_friction_devices_too(name):
+    for differentiated in (False, True):
+        bands = dataclasses.replace(hr.Bands.none(spatial=False), differentiated=differentiated)
+        with pytest.raises(ValueError, match="no whole waveform: use 'inverse', or a grating"):
+            METHODS[name].design(MODEL, bands)
+
+
 def test_every_channel_is_cut_to_its_limit_and_flagged(rng):
     bands, sensed = bands_of([47.0, 111.0], envelope=1e-3), 1e-6 * rng.standard_normal((COUNT, 2))
     drive, flags = check(METHODS["paper"], bands, (sensed, np.full(COUNT, np.nan), np.zeros(COUNT)))

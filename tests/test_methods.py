@@ -75,8 +75,8 @@ def test_a_grating_felt_backwards_is_the_same_function_of_time(name):
 def image(name, frequency):
     """Gain of a method's estimator on the image at twice the carrier."""
     if name == "boxcar":
-        turn = 2 * frequency / RATE
-        return abs(np.sinc(250 * turn) / np.sinc(turn))
+        turn, window = 2 * frequency / RATE, round(frequency // 20.0 * RATE / frequency)
+        return abs(np.sinc(window * turn) / np.sinc(turn))
     return abs(StarSTDFT(bandwidth=10.0, rate=RATE).frequency_response(2 * frequency))
 
 

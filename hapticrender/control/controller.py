@@ -190,7 +190,7 @@ def lowest_carrier(model: DeviceModel, bands: Bands) -> float:
 def refuse_whole_waveform(bands: Bands) -> None:
     """Refuse a texture without carriers, in a method that works band by band."""
     if bands.whole:
-        playable = "gratings, and recordings with carriers >= 1"
+        playable = "use 'inverse', or a grating, or a recording with carriers >= 1"
         raise ValueError(f"texture: this method plays bands, no whole waveform: {playable}")
 
 

@@ -54,20 +54,22 @@ def envelope_loop(
     bandwidths: Bandwidths | None = None,
     feedback: bool = True,
 ) -> tuple[dict[str, Any], float]:
-    """Design the loop of one envelope for the lowest carrier, with the margins of a low-pass loop.
+    """Design the loop of one envelope for the lowest frequency, with the margins of a low-pass loop.
 
     Returns the settings (low pass and loop controller as second-order sections, window in samples), and the bandwidth
     (Hz) of the closed loop, lowered where the delay requires it.
 
-    A `boxcar` estimates by a running mean over one period of the lowest carrier, which removes the image of that
-    carrier and of its harmonics; its delay beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and
-    low pass) are unchecked; by default they are a quarter and half of the lowest carrier, or less where the delay would
-    leave too small a margin; a `DesignError` where even a loop twenty times slower has too small a one.  Without
-    feedback no delay is in the loop.
+    A `boxcar` estimates by a running mean over whole periods of the lowest fixed carrier, as many as one period of the
+    device's lowest frequency holds: it removes that carrier's image, its harmonics' and a steady load's; its delay
+    beyond the low pass's counts as the loop's.  `bandwidths` (Hz, of loop and low pass) are unchecked; by default they
+    are a quarter and half of the device's lowest frequency (of a carrier below it), or less where the delay would leave
+    too small a margin; a `DesignError` where even a loop twenty times slower has too small a one.  Without feedback no
+    delay is in the loop.
     """
     fixed = bands.frequency[bands.wavenumber == 0.0]
     lowest = float(fixed.min(initial=model.lowest_frequency))
-    length = round(model.rate / lowest) if boxcar else 0
+    carrier = float(min(fixed, default=lowest))
+    length = round(carrier // lowest * model.rate / carrier) if boxcar else 0
     delay = model.delay / model.rate if feedback else 0.0
     if boxcar and feedback:
         delay += max((length - 1) / (2 * model.rate) - StarSTDFT(bandwidth=lowest / 2, rate=model.rate).delay, 0.0)
@@ -77,7 +79,7 @@ def envelope_loop(
 
 
 def _widest(lowest: float, delay: float) -> Bandwidths:
-    """Widest loop (Hz), from a quarter of the lowest carrier down, that bears the delay (s); low pass."""
+    """Widest loop (Hz), from a quarter of the lowest frequency down, that bears the delay (s); low pass."""
     width = lowest / 4
     while width * delay > MOST_DELAY:
         width *= NARROWER

@@ -4,7 +4,7 @@
 h, h2           error envelopes by a residual observer, law through the device's dynamic stiffness, finger included
 paper           Grigorii et al. 2021: amplitude and phase loops on the STDFT* at each transducer; the baseline
 paper-common    the same on the mean displacement only; all transducers get the same drive
-boxcar          the paper's loops, per transducer, on a running mean as long as a period of the lowest carrier
+boxcar          the paper's loops, per transducer, on a running mean over whole periods of the lowest carrier
 static          complex loops in the device's coordinates, then the static inverse D(jw) of the free device
 stiffness       the same, then D V + D' dV/dt
 resonant        one integrator a band and coordinate, no low pass; then D V + D' dV/dt
@@ -82,10 +82,12 @@ class Polar:
     def design(self, model: DeviceModel, bands: Bands, *, feedback: bool = True) -> BankController:
         """Design loops on the displacements at the transducers; a `DesignError` where the delay leaves no margin.
 
-        Targets that are modulated or differentiated are refused alike.
+        Targets that are modulated (in a player) or differentiated (along a friction device) are refused alike.
         """
+        refuse_whole_waveform(bands)
         if bands.modulated or bands.differentiated:
-            raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: use 'h2' or 'stiffness'")
+            cure = "use 'inverse', 'h2' or 'stiffness'"
+            raise DesignError(f"method {self.name!r} cannot modulate or differentiate targets: {cure}")
         loop, width = envelope_loop(model, bands, boxcar=self.boxcar, bandwidths=self.bandwidths, feedback=feedback)
         sensor_map, drive_map = model.side_from_coordinate, np.eye(len(model.side_from_coordinate))
         if self.common:
@@ -193,6 +195,8 @@ def low_pass_settings(
     # a waveform's envelopes pass two poles, with the delay of the low pass's two
     analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * width, spacing(bands))
     refuse_whole_waveform(bands)
+    if model.shape is not None:
+        raise DesignError("gradient: must be 0 1/m, this method moves the surface as a whole: use 'inverse', 'h2' or 'h'")
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "waveform_gain": 2 * analysis / model.rate,
