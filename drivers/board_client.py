@@ -31,7 +31,7 @@ FAULTS = {
     Cause.ACTIVE: "the motion grows with the drive: check the polarity of sensors and coils",
     Cause.DRIVE: "the drive stayed above what any finger needs: check wiring and amplifier, and that the board's "
     "sources were exported for the scene that needs most",
-    Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify the bending mode",
+    Cause.RINGING: "the surface rings above 500 Hz: check the delay, and identify bending mode and sensor noise",
     Cause.OVERMOTION: "the surface moved too far: check the polarity of sensors and coils, and the delay",
     Cause.BEYOND: "a sensor shows more than [limits] displacement: press less, and check its unit and offset",
     Cause.SENSOR_GAIN: "a sensor is suddenly inverted, disconnected, or its gain has changed: check its wiring",

@@ -115,9 +115,13 @@ def scales(key: str, value: Any, channels: int = 0) -> float | tuple[float, ...]
 
 def frequencies(value: Any, *, zero: bool) -> np.ndarray[Any, Any]:
     """Return frequencies (Hz) as an array, if all are finite and > 0, or `zero`."""
-    hertz = np.asarray(value, float)
+    bound = f"finite numbers {'>=' if zero else '>'} 0 Hz"
+    try:
+        hertz = np.asarray(value, float)
+    except (TypeError, ValueError):
+        refuse("frequency", value, bound, TypeError)
     good = (np.isfinite(hertz) & ((hertz >= 0) if zero else (hertz > 0))).all()
-    require(bool(good), "frequency", value, f"finite numbers {'>=' if zero else '>'} 0 Hz")
+    require(bool(good), "frequency", value, bound)
     return hertz
 
 

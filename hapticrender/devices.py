@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hapticrender.checks import require
 from hapticrender.errors import DriverError, HapticError
 from hapticrender.formatting import table
 
@@ -31,7 +32,10 @@ EXTRAS = (  # package, extra, what it is good for
 SIMULATED = "simulated"
 SCALES = ("drive_per_full_scale", "sensed_per_full_scale", "delay")  # entries of a calibration that a driver takes
 _MADE: weakref.WeakValueDictionary[int, Any] = weakref.WeakValueDictionary()  # by `open_driver`, by their id
-FORMS = "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or package.module:callable for one of your own"
+FORMS = (
+    "NAME, NAME:ARGUMENT, NAME:ARGUMENT?OPTION=VALUE&..., or for one of your own package.module:callable, alike with "
+    ":ARGUMENT and ?OPTION=VALUE&..."
+)
 
 
 def registered(group: str, name: str) -> Any:
@@ -51,7 +55,8 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
 
     `text` is "simulated"; the name of an installed driver, with its argument after a colon ("audio:0",
     "serial:/dev/ttyACM0", "wavefile:drive.wav"); or "package.module:callable", which is called with what follows a
-    second colon, if anything does.  Behind a "?" are keyword arguments, numbers, numbers with commas between or words:
+    second colon, if anything does ("package.module:callable?block=10" has options alone).  Behind a "?" are keyword
+    arguments, numbers, numbers with commas between or words:
     "audio:0?block=256&rate=44100&channels=3,4", "serial:/dev/ttyACM0?baud=921600".  A driver gets those entries of the
     calibration in the device's `profile`, by keyword, that its parameters name (``drive_per_full_scale``,
     ``sensed_per_full_scale``, ``delay``, ``gain_uncertainty``), and a parameter ``profile`` the profile itself; a
@@ -75,11 +80,12 @@ def open_driver(text: str, profile: "DeviceProfile | None" = None, overwrite: bo
     if name in _points("drivers"):
         factory = registered("drivers", name)
     else:
-        called, colon, argument = argument.partition(":")
-        factory = imported(text, name, called)
+        called, mark, after = argument.partition("?")  # options may have colons in them
+        called, colon, argument = called.partition(":")
+        factory, name, argument = imported(text, name, called), f"{name}:{called}", argument + mark + after
     try:
         with naming_driver(text, ValueError, TypeError):
-            argument, options = _split(argument, factory)
+            argument, options = _split(argument, factory, bool(colon))
             taken = inspect.signature(factory).parameters if profile or overwrite else {}
             offered = {
                 **(vars(profile.calibration) if profile else {}),
@@ -159,8 +165,8 @@ def imported(text: str, module: str, called: str) -> Any:
     return factory
 
 
-def _split(argument: str, factory: Callable[..., Any]) -> tuple[str, dict[str, Any]]:
-    """Split "0?block=256&channels=3,4" into argument and options of the factory.
+def _split(argument: str, factory: Callable[..., Any], first: bool) -> tuple[str, dict[str, Any]]:
+    """Split "0?block=256&channels=3,4" into argument and options of the factory; its `first` parameter is no option.
 
     A "?" without names and values behind it, or in the name of a file that is there, is of the argument.
     """
@@ -168,12 +174,14 @@ def _split(argument: str, factory: Callable[..., Any]) -> tuple[str, dict[str, A
     pairs = [each.partition("=") for each in after.split("&")]
     named = bool(mark) and all(name.isidentifier() and equals for name, equals, _ in pairs)
     if not named or os.path.exists(argument):
+        require(first or not argument, "options", argument, "?OPTION=VALUE&...")
         return argument, {}
     options: dict[str, Any] = {name: value for name, _, value in pairs}
     taken = inspect.signature(factory).parameters
     if not any(each.kind is each.VAR_KEYWORD for each in taken.values()):
-        for name in options.keys() - list(taken)[1:]:
-            raise ValueError(f"option {name!r}: must be one of {', '.join(list(taken)[1:])}")
+        known = list(taken)[first:]
+        for name in options.keys() - known:
+            raise ValueError(f"option {name!r}: must be one of {', '.join(known)}")
     for name, value in options.items():
         with suppress(ValueError, SyntaxError):  # a word
             options[name] = ast.literal_eval(value)

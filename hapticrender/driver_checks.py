@@ -15,6 +15,7 @@ from hapticrender.protocols import Array, Flag, Sensed
 _MEMBERS = ("rate", "drive_channels", "sensed_channels", "block", "delay", "play", "__enter__", "__exit__")
 _LEAST = {"drive_channels": 1, "sensed_channels": 0, "block": 1}
 FARTHEST = 2.0  # m from the middle: as far as motions reach; most positions in mm are beyond
+LOADS = (-1.0, 100.0)  # N: no finger presses harder, most loads in mN are beyond; one's offset may be negative
 MOST_RATE = 1e7  # Hz: of the fastest device that parameters can state; filters and logs take memory by it
 FLAGS = sum(Flag)  # all bits
 OPEN: set[int] = set()  # identities of the devices that play
@@ -107,6 +108,9 @@ def _column(driver: Any, name: str, value: Any, shape: tuple[int, ...]) -> Array
             f"{column[beyond][0]:g} m: must be within {FARTHEST:g} m of the middle, in m and not mm, NaN while lifted"
         )
         raise ProtocolError(f"{where} is {found}")
+    if name == "normal_load" and (beyond := (column < LOADS[0]) | (column > LOADS[1])).any():
+        bound = f"from {LOADS[0]:g} to {LOADS[1]:g} N, NaN where it is not known"
+        raise ProtocolError(f"{where} is {column[beyond][0]:g} N: must be {bound}")
     if kind is np.int64 and (unknown := int(np.bitwise_or.reduce(column)) & ~FLAGS):
         raise ProtocolError(f"{where} has bits {unknown}, must be of hapticrender.Flag, 0 to {FLAGS}")
     return column

@@ -47,7 +47,7 @@ class Sensed(NamedTuple):
     sensed: Array  # (n, sensed_channels), in the sensors' unit (m on a plate)
     position: Array | None = None  # (n,), m (2 at most) from the middle of the surface, NaN while no finger touches
     motion: Array | None = None  # (n, places): true motion at the evaluation points (model.places), where it is known
-    normal_load: Array | None = None  # (n,), N
+    normal_load: Array | None = None  # (n,), N (-1 to 100), NaN where it is not known
     flags: Array | None = None  # (n,), `Flag` bits raised by the device
 
     def __eq__(self, other: object) -> bool:

@@ -183,15 +183,18 @@ def read_tables(
     }
     for table, (values, known) in tables.items():
         for key in values:
-            others = " or ".join(f"[{name}]" for name, (_, keys) in tables.items() if key in keys)
+            others = " or ".join(f"[{name}]" for name, (_, keys) in tables.items() if key in keys | scene_keys(name))
             if key not in known and others:
                 raise ValueError(f"{table}.{key}: belongs in {others}")
         with checks.inside(table):
             checks.check_names(values, known, scene_keys(table))
     with checks.inside("render"):
         chosen = settings.with_overrides(scene.rendering)
-    with checks.inside("device"):
-        common = {key: value for key, value in scene.simulation.items() if key in level}
+    common = {key: value for key, value in scene.simulation.items() if key in level}
+    try:
         assumed = device.with_overrides({**common, **scene.profile})
+    except (TypeError, ValueError) as problem:
+        with checks.inside("simulation" if str(problem).partition(" ")[0] in common else "device"):
+            raise problem
     with checks.inside("simulation"):
         return chosen, assumed, device.with_overrides({**scene.profile, **scene.simulation})

@@ -25,11 +25,12 @@ from hapticrender.plants.hybrid import COILS, PLACES, SENSORS, HybridPlant
 from hapticrender.plants.plate import PlateParameters
 from hapticrender.protocols import Array, Driver, Method, Sensed
 from hapticrender.renderers.base import BaseRenderer
+from hapticrender.renderers.electroadhesion import LEVEL as SCREEN_LEVEL
 from hapticrender.renderers.electroadhesion import ElectroadhesionRenderer, ElectroadhesionSettings, ScreenSetup
 from hapticrender.renderers.friction import RATIO
 from hapticrender.renderers.limits import perceptible
 from hapticrender.renderers.shaped import Port, ShapedDriver
-from hapticrender.renderers.vibrotactile import PlateSetup, VibrotactileRenderer
+from hapticrender.renderers.vibrotactile import LEVEL, PlateSetup, VibrotactileRenderer
 from hapticrender.touch.scene import Scene, scene_keys
 
 BOTH = "rate"  # the parameter that plate and screen share
@@ -233,14 +234,17 @@ def _split(scene: Scene) -> tuple[HybridSettings, Scene, Scene]:
     rendering = {key: value for key, value in scene.rendering.items() if key not in own}
     plate: dict[str, Any] = {"rendering": {key: value for key, value in rendering.items() if key == "probe"}}
     screen: dict[str, Any] = {"rendering": rendering, "limits": {}}  # which are the plate's
-    for field, table in (("profile", "device"), ("simulation", "simulation")):
+    moved = dict.fromkeys(own | of_screen | scene_keys("render"), "render")
+    in_device = moved | dict.fromkeys({*LEVEL, *SCREEN_LEVEL} | scene_keys("simulation"), "simulation")
+    in_simulation = moved | dict.fromkeys({BOTH} | scene_keys("device"), "device")
+    for field, table, others in (("profile", "device", in_device), ("simulation", "simulation", in_simulation)):
         with inside(table):
-            plate[field], screen[field] = _split_table(getattr(scene, field), own | of_screen)
+            plate[field], screen[field] = _split_table(getattr(scene, field), others)
     return settings, replace(scene, **plate), replace(scene, **screen)
 
 
-def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str, Any]]:
-    """Parameters of the plate and of the screen.
+def _split_table(values: Mapping[str, Any], others: Mapping[str, str]) -> list[dict[str, Any]]:
+    """Parameters of the plate and of the screen; `others` are keys that belong in another table, by its name.
 
     A parameter that both have has `plate_` or `screen_` before its name, but for the rate that they share.
     """
@@ -253,7 +257,7 @@ def _split_table(values: Mapping[str, Any], settings: set[str]) -> list[dict[str
     for key, value in values.items():
         if key in double:
             raise ValueError(f"{key} = {value!r}: must be plate_{key} or screen_{key}: both have one")
-        if key in settings:
-            raise ValueError(f"{key}: belongs in [render]")
-    check_names(values, known[0] | known[1])
+        if key in others:
+            raise ValueError(f"{key}: belongs in [{others[key]}]")
+    check_names(values, (known[0] | known[1]).keys() - others.keys())
     return [{names[key]: value for key, value in values.items() if key in names} for names in known]

@@ -37,6 +37,13 @@ class Calibrated(Bench):
         return ["7  a box on the bench, 2 out", "9"]
 
 
+class Needy(Calibrated):
+    """A driver that cannot do without its argument."""
+
+    def __init__(self, path):
+        super().__init__(path)
+
+
 NOT_CALLABLE = 3
 
 
@@ -45,6 +52,10 @@ def test_a_text_makes_a_driver(tmp_path):
     assert open_driver(f"wavefile:{tmp_path / 'a:b.wav'}").path == tmp_path / "a:b.wav"  # only the first colon counts
     assert open_driver("test_devices:Calibrated").argument == ""
     assert open_driver("test_devices:Calibrated:a:b").argument == "a:b"
+    for text in ("test_devices:Calibrated?delay=2", "test_devices:Calibrated:a?b?delay=2"):
+        made = open_driver(text)
+        assert (made.argument, made.delay) == ("a?b" if ":a" in text else "", 2)
+    assert open_driver("test_devices:Calibrated?argument=a:b").argument == "a:b"  # an option where none stands before
 
 
 def test_a_driver_gets_what_it_names_of_its_profile_and_no_more():
@@ -83,6 +94,11 @@ REFUSED = [
     ("os:getcwd", ValueError, "driver = 'os:getcwd': it returned a str: must be a driver"),
     ("gc:enable", ValueError, "driver = 'gc:enable': it returned a NoneType: must be a driver"),
     ("wavefile", ValueError, "driver = 'wavefile': .*missing.*path.*give its argument as wavefile:ARGUMENT"),
+    ("test_devices:Tea?delay=2", ValueError, "has no attribute 'Tea'"),
+    ("test_devices:Calibrated?tea=2", ValueError, "'tea': must be one of argument, drive_per_full_scale, delay, prof"),
+    ("test_devices:Calibrated:a?argument=2", ValueError, "'argument': must be one of drive_per_full_scale, delay"),
+    ("test_devices:Calibrated?delay", ValueError, r"options = '\?delay': must be \?OPTION=VALUE"),
+    ("test_devices:Needy", ValueError, r"missing .* 'path'; give its argument as test_devices:Needy:ARGUMENT\?OPTION"),
     ("wavefile:a.tea", ValueError, "ending '.tea' must be one of .wav"),
 ]
 

@@ -135,12 +135,23 @@ def test_an_object_that_is_no_driver_hears_what_it_lacks():
         ({"sensed": np.ones((4, 1)) + 0j}, "sensed is no array of numbers: it is complex"),
         ({"position": np.array([0.0, np.nan, np.inf, 0.0])}, "position is inf m: must be within 2 m of the middle"),
         ({"position": np.array([0.0, np.nan, 0.0, -20.0])}, "position is -20 m: must be within 2 m .* in m and not mm"),
+        (
+            {"normal_load": np.array([0.0, np.nan, 0.4, -5.0])},
+            "normal_load is -5 N: must be from -1 to 100 N, NaN where",
+        ),
+        ({"normal_load": np.array([0.0, 400.0, 0.4, 1.0])}, "normal_load is 400 N: must be from -1 to 100 N"),
+        ({"normal_load": np.array([0.0, np.inf, 0.4, 1.0])}, "normal_load is inf N"),
     ],
 )
 def test_a_column_that_would_lose_something_is_refused(columns, message):
     assert check_sensed(Diary(), Sensed(np.ones((4, 1)), flags=np.full(4, 8.0)), 0).flags.dtype == np.int64
     with pytest.raises(ProtocolError, match=message):
         check_sensed(Diary(), Sensed(**{"sensed": np.ones((4, 1))} | columns), 0)
+
+
+def test_a_load_may_have_an_offset_or_be_unknown():
+    load = np.array([-1.0, 0.0, np.nan, 100.0])
+    np.testing.assert_array_equal(check_sensed(Diary(), Sensed(np.ones((4, 1)), normal_load=load), 0).normal_load, load)
 
 
 @pytest.mark.parametrize("found", [np.ones((4, 1)), (np.ones((4, 1)),), None])

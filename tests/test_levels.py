@@ -153,7 +153,11 @@ def test_what_cannot_be_predicted_is_not_taken_and_says_why():
     assert reasons["no finger"] == "the finger moves: its load moves the plate, or the texture follows it"
     assert reasons[ONE] == "the load of a moving finger tilts the plate"
     hybrid = replace(temporal(FREE, 120.0), device="hybrid")
-    assert least_model(hybrid).text.endswith("the device has one level only")
+    assert least_model(hybrid).text.endswith("no lesser level of this 'hybrid' is known")
+    near = temporal(SLIDING, 120.0, 130.0)
+    lines = [str(level) for level in least_model(near).levels if not level.reason]
+    assert lines
+    assert all("not taken, the difference cannot be predicted: carriers too near" in line for line in lines)
     chirp = hr.Chirp(start=30.0, stop=300.0, duration=1.0, amplitude=5e-6)  # the levels differ by 3.7 % of it
     (envelope,) = least_model(replace(temporal(SLIDING, 120.0), texture=chirp, device="ultrasonic")).levels
     assert not envelope.taken

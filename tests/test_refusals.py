@@ -336,6 +336,9 @@ DESIGNS = [
     (lambda: in_blocks().run(*map(np.zeros, ((25, 2), 1, 25))), r"\(1,\), \(25,\)\): must be \(\(25, 2\), \(25,\)"),
     (lambda: demodulator(frequency=[]), "at least one number"),
     (lambda: demodulator(frequency=[2501.0]), "half the rate, 2500 Hz"),
+    (lambda: demodulator(frequency=[-1.0]), r"frequency = \[-1.0\]: must be finite numbers >= 0 Hz"),
+    (lambda: demodulator(frequency="loud"), "frequency = 'loud': must be finite numbers >= 0 Hz"),
+    (lambda: hr.detection_threshold("loud"), "frequency = 'loud': must be finite numbers >= 0 Hz"),
     (lambda: demodulator().run(np.zeros((4, 2))), r"must be \(n, 1\)"),
     (lambda: StarSTDFT(bandwidth=2500.0, rate=5000.0), "bandwidth=2500.0 Hz must lie between 0 and half the rate"),
     (lambda: reduced_controller(5.0, 5.0), "loop_bandwidth=5.0 Hz: must be > 0 and below filter_bandwidth=5.0 Hz"),
@@ -422,8 +425,36 @@ def test_every_name_is_listed_once_in_order_and_accepted(device):
         ({"simulation": {"rate": 1e4}}, r"simulation.rate: belongs in \[device\]"),
         ({"device": "electroadhesion", "profile": {"headroom": 2.0}}, r"device.headroom: belongs in \[render\]"),
         ({"device": "hybrid", "simulation": {"crossover": 90.0}}, r"simulation.crossover: belongs in \[render\]"),
+        *(
+            ({"device": device, "profile": {"seed": 1}}, r"device.seed: belongs in \[simulation\]")
+            for device in ONE_EACH
+        ),
+        ({"device": "hybrid", "simulation": {"method": "h2"}}, r"simulation.method: belongs in \[render\]"),
+        ({"device": "hybrid", "simulation": {"rate": 1e4}}, r"simulation.rate: belongs in \[device\]"),
+        ({"device": "hybrid", "profile": {"level": "carrier"}}, r"device.level: belongs in \[simulation\]"),
     ],
 )
 def test_a_parameter_in_the_wrong_table_is_sent_to_the_right_one(fields, message):
     with pytest.raises(ValueError, match=message):
         opened_on(**{"device": "vt-plate", **fields})
+
+
+@pytest.mark.parametrize("device", ["electroadhesion", "ultrasonic", "hybrid"])
+@pytest.mark.parametrize(("table", "wrong"), [("simulation", {"level": "auto"}), ("profile", {"memory_length": -1.0})])
+def test_a_wrong_entry_is_named_with_the_table_that_it_stands_in(device, table, wrong):
+    """The level counts in the design, too, and is no entry of [device] for that."""
+    name = {"simulation": "simulation", "profile": "device"}[table]
+    with pytest.raises(ValueError, match=rf"^{name}.{next(iter(wrong))} = "):
+        opened_on(device, **{table: wrong})
+
+
+def test_a_hybrid_lists_what_each_of_its_tables_takes():
+    for table, field, others in (
+        ("device", "profile", ("level", "degrees_of_freedom")),
+        ("simulation",) * 2 + (("rate",),),
+    ):
+        with pytest.raises(ValueError, match=f"^{table}.tea = 1: unknown key; known: ") as refused:
+            opened_on("hybrid", **{field: {"tea": 1}})
+        listed = re.findall(r"\w+", str(refused.value))
+        assert not set(others) & set(listed)
+        assert {"screen_current_limit", "coils", "area_scale"} <= set(listed)

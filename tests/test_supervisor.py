@@ -1,6 +1,7 @@
 """The supervisor and the start-up probe, on both sides: faults stop the drive in time, normal scenes are left alone."""
 
 import warnings
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +21,7 @@ from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.touch.mechanics import HEAVY_SECOND
 
 RATE, START = 5000.0, 0.5  # Hz, s: when a fault begins
+SLIDE = hr.Finger.sliding(speed=0.08, normal_load=0.4, mechanics="light")
 TOUCH = hr.Finger.still(normal_load=0.8, touches=((0.5, 5.0),), mechanics=HEAVY_SECOND)
 FINGER = {"finger": (HEAVY_SECOND.mass, HEAVY_SECOND.damping, HEAVY_SECOND.stiffness), "load": 0.8}
 
@@ -289,6 +291,14 @@ def test_a_ringing_damper_is_turned_down_and_the_texture_goes_on():
     assert abs(recording.drive[-1000:]).max() < 0.2
     motion = recording.motion[-1000:, 0]
     assert np.ptp(motion) / 2 == pytest.approx(50e-6, rel=0.1)
+
+
+@pytest.mark.parametrize(("table", "stops"), [("simulation", True), ("profile", False)])
+def test_sensors_noisier_than_stated_are_named_where_they_stop_the_drive(table, stops):
+    """5 um, of which the supervisor expects 1 um unless the profile states it."""
+    noisy = scene(80.0, 10e-6, 0.6, finger=SLIDE, **{table: {"sensor_noise": 5e-6}})
+    with pytest.raises(hr.DeviceFault, match="rings above 500 Hz .* the sensors' noise") if stops else nullcontext():
+        hr.render(noisy)
 
 
 @pytest.mark.parametrize("frequency", [700.0, 1700.0])

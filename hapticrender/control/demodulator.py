@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticrender.checks import integer, number
+from hapticrender.checks import frequencies, integer, number
 from hapticrender.control.records import W, aligned
 from hapticrender.jit import entry, kernel, record
 from hapticrender.mathx import unit
@@ -142,7 +142,7 @@ class Demodulator:
     def __init__(self, frequency: Any, bandwidth: float, rate: float, channels: int = 1) -> None:
         rate, bandwidth = number("rate", rate, "Hz", above=0.0), number("bandwidth", bandwidth, "Hz")
         b, a = StarSTDFT(bandwidth=bandwidth, rate=rate).coefficients
-        frequency = np.atleast_1d(np.asarray(frequency, float))
+        frequency = np.atleast_1d(frequencies(frequency, zero=True))
         if frequency.ndim != 1 or not frequency.size or not ((frequency >= 0) & (frequency <= rate / 2)).all():
             raise ValueError(f"{frequency=} Hz must be at least one number from 0 to half the rate, {rate / 2:g} Hz")
         self.frequency, self.channels, self._sample = frequency, integer("channels", channels, least=1), 0

@@ -196,7 +196,9 @@ def low_pass_settings(
     analysis = min(2 * math.pi * math.sqrt(2.0) * 2.0 * width, spacing(bands))
     refuse_whole_waveform(bands)
     if model.shape is not None:
-        raise DesignError("gradient: must be 0 1/m, this method moves the surface as a whole: use 'inverse', 'h2' or 'h'")
+        raise DesignError(
+            "gradient: must be 0 1/m, this method moves the surface as a whole: use 'inverse', 'h2' or 'h'"
+        )
     return {
         **shared_settings(model, bands, sensor_map, drive_map, feedback),
         "waveform_gain": 2 * analysis / model.rate,

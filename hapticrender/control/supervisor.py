@@ -103,7 +103,8 @@ CAUSES = {
     ),
     RINGING: (
         "the surface rings above 500 Hz with the inner damper turned off",
-        "the delay of the loop, and [device] with the bending mode that `hapticrender identify` finds",
+        "the delay of the loop, and [device] with the bending mode and the sensors' noise that `hapticrender identify` "
+        "finds",
     ),
     OVERMOTION: (
         "the surface moved farther than the scene and a press can move it; most likely the loop is unstable",

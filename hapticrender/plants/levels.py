@@ -36,12 +36,15 @@ POINTS = 600  # along the path
 FIT_FREQUENCIES = 50  # at which a finger of lower order is fitted, at most
 JUDGED = 0.999 * LOWEST_FREQUENCY  # Hz: slower carriers are not judged
 
+UNPREDICTED = "the difference cannot be predicted: carriers too near, that sweep or pass the rate, or a load that moves"
+
 
 @dataclass(frozen=True)
 class Level:
     """A simplification by name, whether it is taken, and its predicted relative difference (1), or why there is none.
 
-    The difference is that from the full model with everything taken before; infinite where it is not predicted.
+    The difference is that from the full model with everything taken before; infinite where it is not predicted, since
+    carriers are near each other, sweep or pass the rate, or a load that moves may leak into them.
     """
 
     name: str
@@ -51,7 +54,8 @@ class Level:
 
     def __str__(self) -> str:
         verdict = "taken" if self.taken else "not taken"
-        return f"{self.name}: {verdict}, {self.reason or f'predicted difference {100 * self.difference:.2g} %'}"
+        found = f"predicted difference {100 * self.difference:.2g} %" if self.difference < math.inf else UNPREDICTED
+        return f"{self.name}: {verdict}, {self.reason or found}"
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class LeastModel:
     @property
     def text(self) -> str:
         """One line for every level tried."""
-        lines = [str(level) for level in self.levels] or ["the device has one level only"]
+        lines = [str(level) for level in self.levels] or [f"no lesser level of this {self.scene.device!r} is known"]
         return "\n  ".join([f"least model within {100 * self.tolerance:.2g} %:", *lines])
 
 
