@@ -64,8 +64,12 @@ def test_the_banks_of_bands_leave_an_overload_undistorted_in_a_quarter_of_a_seco
 
 @pytest.mark.parametrize("case", ["overload", "electroadhesion: harmonic", "electroadhesion: swipe"])
 def test_where_the_baselines_fail(case):
-    figures = run_suite(["paper", "boxcar"], [case])
+    """Of the tones of the harmonic, 50 Hz is not a multiple of 20: a mean over 50 ms left the mean friction in it."""
+    played = ["paper"] if case == "electroadhesion: harmonic" else ["paper", "boxcar"]
+    figures = run_suite(played, [case])
     assert len(missed(figures)) == len(figures) > 0
+    if "boxcar" not in played:
+        assert missed(run_suite(["boxcar"], [case])) == []
     if case != "electroadhesion: swipe":  # whose targets grow with the finger's speed, which these refuse
         assert np.isfinite([each.value for each in figures]).any()
 
