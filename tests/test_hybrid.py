@@ -73,6 +73,21 @@ def test_a_tone_is_felt_whole(frequency):
     assert (rubbed > 0.0) == (frequency > START)
 
 
+@pytest.mark.parametrize(("played", "found"), [(1.0, "passed"), (0.0, "failed")])
+def test_a_lift_takes_the_fingers_own_friction_along_and_is_no_error(played, found, tmp_path):
+    """Of 0.21 m/s, 50 times the texture; read from a file, with the texture taken off before the lift or not."""
+    finger = replace(SLIDE, touches=((0.0, 1.5),))
+    recording = hr.render(scene(hr.Grating(frequency=90.0, amplitude=1e-5), finger, 2.0))
+    recording.save(tmp_path / "lift.npz")
+    recording = hr.Recording.load(tmp_path / "lift.npz")
+    columns = recording.header.slices
+    recording.frames = np.array(recording.frames[:])
+    recording.frames[:, columns["motion"]] -= (1.0 - played) * recording.frames[:, columns["reference"]]
+    figures = recording.summary()
+    assert figures["verdict"] == found
+    assert (figures["waveform"]["places"]["skin"]["waveform_error"] < FELT) == (found == "passed")
+
+
 def test_a_carrier_that_follows_the_finger_is_felt_whole_while_it_is_handed_over():
     """Under constant acceleration of 0.3 m/s2, judged from 60 Hz on, the screen taking all from 133 Hz on."""
     time = np.linspace(0.0, 0.7, 1401)

@@ -105,6 +105,27 @@ def test_the_friction_that_a_touch_brings_along_is_no_error_of_the_texture(wrong
     assert summary["verdict"] == verdict, summary["reason"]
 
 
+@pytest.mark.parametrize(("again", "found"), [(1.0, "passed"), (0.0, "failed")])
+def test_the_skin_of_a_hybrid_is_judged_while_it_is_touched(again, found):
+    """0.33 N of friction of the finger's own are 0.21 m/s; lifted, it leaves the plate's share of the tone alone."""
+    time, bands = times(4.0), make_bands(90.0, 0.0)
+    touching = (time < 2.0) | (time >= 2.5)
+    texture = 5.6e-3 * np.sin(180 * np.pi * time)
+    gain = np.where(touching, np.where(time < 2.0, 1.0, again), 0.7)
+    motion = (gain * texture + 0.21 * touching)[:, None]
+    signals = make_signals(bands, 0.0, extra=motion, position=np.where(touching, 0.0, np.nan))
+    summary = summary_of(bands, signals | {"reference": texture}, {"unit": "m/s"})
+    assert summary["verdict"] == found
+    assert (summary["worst"]["value"] < 0.01) == (found == "passed")
+
+
+@pytest.mark.parametrize(("gain", "found"), [(1.0, "passed"), (0.7, "failed")])
+def test_a_hybrid_that_nobody_touches_is_judged_by_its_plate(gain, found):
+    texture, bands = 5.6e-3 * np.sin(180 * np.pi * times(4.0)), make_bands(90.0, 0.0)
+    signals = make_signals(bands, 0.0, extra=gain * texture[:, None]) | {"reference": texture}
+    assert summary_of(bands, signals, {"unit": "m/s"})["verdict"] == found
+
+
 def test_a_stored_play_of_826e4c4_that_passed_then_fails():
     """White noise of 5 um by the default of commit 826e4c4, whose verdict was "within its tolerance".
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 
 FLUSH = 0.25  # s of signal: the most that a killed process loses
+READ_AT_ONCE = 2**17  # samples
 
 
 class Recorder:
@@ -243,6 +244,12 @@ class Recording:
         blocks = journal.chunks(self.frames, columns, start, stop, step)
         parts = [journal.column(self.header, block, name).copy() for block in blocks]  # not a view of all columns
         return np.concatenate(parts) if parts else journal.column(self.header, np.empty((0, columns)), name)
+
+    @cached_property
+    def touched(self) -> bool:
+        """Whether a finger is on the surface in any sample (found once)."""
+        pieces = range(0, len(self), READ_AT_ONCE)
+        return any(np.isfinite(self.read("position", start, start + READ_AT_ONCE)).any() for start in pieces)
 
     @cached_property
     def envelopes(self) -> Envelopes:

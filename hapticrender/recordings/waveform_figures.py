@@ -41,6 +41,7 @@ SPUR = 0.01  # of the rms of the whole reference: S_b where no threshold is know
 LOOSER = 2.0  # times the tolerance: bound on a third octave and on the worst windows
 LEAST = 1e-4  # share of the reference's energy in B, and of the least energy felt, below which nothing is judged
 LONGEST_DELAY, DELAYS = 20e-3, 4001  # s, of the best delay; how many are tried
+FRICTION = ("N", "m/s")  # units of what a finger's own friction is part of: of friction, and of a hybrid's skin
 LANDING = 3e-3  # s: five memory lengths of a contact at 20 mm/s, in which the friction of a touch builds up
 AFTER_CONTACT = (0.0, 0.05, 0.2)  # s: edges of the two spans that are stated
 
@@ -119,18 +120,22 @@ def _scales(header: Header) -> tuple[Array, Array]:
 
 
 def _signals(recording: Recording, start: int, stop: int) -> Array:
-    """Reference, and error at every place relative to its share of the target, shape (n, 1 + places)."""
+    """Reference, and error at every place relative to its share of the target, shape (n, 1 + places).
+
+    Both are 0 while the finger that a friction device or a hybrid is felt by is away.
+    """
     shares, scales = _scales(recording.header)
     names = "reference", "motion"
     values = (np.asarray(recording.read(name, start, stop)) for name in names)
     reference, motion = (np.where(np.abs(each) < RUNAWAY, each, np.nan) for each in values)
     landed = np.zeros(len(motion), bool)
-    if recording.header.unit == "N":
+    if recording.header.unit in FRICTION and recording.touched:
         landing, before = round(LANDING * recording.rate), max(start - round(LANDING * recording.rate), 0)
         touching = np.isfinite(recording.read("position", before, stop))
         touching = np.pad(touching, (landing - start + before, 0), mode="edge")  # a run begins as it is
         felt = np.asarray(sliding_window_view(touching, landing + 1).all(axis=1))
         motion, landed = _without_base(motion, touching[landing:], felt), touching[landing:] & ~felt
+        reference = reference * touching[landing:]
     error = (motion - np.outer(reference, shares)) / scales
     error[landed] *= 0.0
     return np.column_stack([reference, error])
