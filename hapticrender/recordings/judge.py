@@ -10,7 +10,7 @@ from hapticrender.formatting import bands_label, percent
 from hapticrender.protocols import Array, Flag
 from hapticrender.recordings.envelopes import DIVERGING, RUNAWAY, Envelopes, amplitude_error, judged_from
 from hapticrender.recordings.recording import Recording
-from hapticrender.recordings.waveform_figures import BAND, LEAST, LOOSER, WINDOW
+from hapticrender.recordings.waveform_figures import BAND, LOOSER, WINDOW
 
 READ_AT_ONCE = 2**18  # samples
 SETTLED = 0.05  # of the target
@@ -166,7 +166,7 @@ def _unjudged(recording: Recording) -> str:
         return f"the run is too short: needs >= {needed:g} s"
     if not found["rms_reference"]:
         return "the texture is zero, or far below what can be felt"
-    if found["share_in_band"] < LEAST:
+    if None in found["places"].values():
         return f"the texture has nothing from {IN_BAND}"
     return INFERRED if header.motion_source == "inferred" else ""
 

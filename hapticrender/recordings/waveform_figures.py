@@ -71,14 +71,15 @@ def waveform_figures(recording: Recording) -> dict[str, Any]:
     rms = found["rms_reference"] = math.sqrt(reference.sum())
     if not rms > _least(header.unit):
         return found | {"rms_reference": 0.0}
-    found["share_in_band"] = float(reference[inside].sum() / reference.sum())
-    found["share_outside"] = _outside(reference, frequency, inside, header.unit)
-    if found["share_in_band"] < LEAST:
-        return found
     total = spectrum[_within(frequency, *_band(rate))].sum(axis=0)
     weights = np.append(np.ones(count), [(stop - whole) / window] * (whole < stop))  # of the last one what is new
+    least = min(total[0], weights @ power[:, 0] / weights.sum())  # rms_B(r)^2: no figure of B divides by less
+    found["share_in_band"] = float(reference[inside].sum() / reference.sum())
+    found["share_outside"] = _outside(reference, frequency, inside, header.unit)
+    if least < LEAST * reference.sum():
+        return found
     shares, scales = _scales(header)
-    noise = _noise(recording, *_band(rate)) / scales / math.sqrt(reference[inside].sum())
+    noise = _noise(recording, *_band(rate)) / scales / math.sqrt(least)
     found["sensor_noise"] = float(noise.max())
     for i, place in enumerate(places, start=1):
         alike = float(weights @ power[:, i] / (weights @ power[:, 0]))
