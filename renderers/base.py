@@ -169,16 +169,18 @@ def read_tables(
     settings: type[Settings],
     level: Collection[str],
     more: Collection[str] = (),
+    design: Collection[str] = (),
 ) -> tuple[Any, Any, Any]:
     """Settings of a renderer, and the parameters of its device as assumed by the controller and as simulated.
 
     Refuses a key that stands in the wrong table of a scene, or in none.  Parameters of the model `level` stand in
-    [simulation] and hold for both devices; `more` are those that only some of the devices have.
+    [simulation] and hold for both devices; `more` are those that only some of the devices have; those of the `design`
+    say nothing of a device, and stand in [device].
     """
     names = {*device.names(), *more}
     tables: dict[str, tuple[Mapping[str, Any], set[str]]] = {
         "device": (scene.profile, names - set(level)),
-        "simulation": (scene.simulation, names - {"rate"}),
+        "simulation": (scene.simulation, names - {"rate", *design}),
         "render": (scene.rendering, settings.names()),
     }
     for table, (values, known) in tables.items():

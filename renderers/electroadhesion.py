@@ -20,6 +20,7 @@ from hapticrender.renderers.shaped import CarrierDriver, Port, ShapedDriver
 from hapticrender.touch.scene import Scene
 
 LEVEL = ("level", "oversampling")  # how finely a screen is modelled
+DESIGN = ("open_loop_gain",)  # of the control alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +86,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
     def read(self, scene: Scene, driver: Driver | None) -> ScreenSetup:
         """Read the tables of a scene; refuses one that needs more attraction than the source can make."""
-        setup = ScreenSetup(scene, *read_tables(scene, ElectroadhesionParameters, ElectroadhesionSettings, LEVEL))
+        tables = read_tables(scene, ElectroadhesionParameters, ElectroadhesionSettings, LEVEL, design=DESIGN)
+        setup = ScreenSetup(scene, *tables)
         assumed, current = setup.assumed, setup.assumed.drive_kind == "current"
         source = (assumed.current_limit, "A") if current else (assumed.voltage_limit, "V")
         carrier_limit(scene.device_profile.limits, *source)  # refuses what no finger's load could make right

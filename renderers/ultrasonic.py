@@ -24,6 +24,7 @@ from hapticrender.touch.scene import Scene
 WORST_SKIN = 3.0  # damping of a finger over that assumed
 LEAST_NOISE = 1e-6  # of the range: of a friction that is computed from the amplitude
 LEVEL = ("level", "oversampling", "envelope_oversampling", "envelope_frequency")  # how finely a surface is modelled
+DESIGN = ("bias", "lock")  # of the control alone
 
 
 @dataclass(frozen=True)
@@ -54,15 +55,15 @@ class UltrasonicRenderer(FrictionRenderer):
         """Read the tables of a scene."""
         law = LAWS.get(str({**scene.profile, **scene.simulation}.get("law")), LAWS["fit"])
         more = UltrasonicParameters.names() | law.names()
-        settings, assumed, simulated = read_tables(scene, SurfaceParameters, FrictionSettings, LEVEL, more)
+        settings, assumed, simulated = read_tables(scene, SurfaceParameters, FrictionSettings, LEVEL, more, DESIGN)
         limit = carrier_limit(scene.device_profile.limits, assumed.mode.drive_limit, "V")
         assumed = replace(assumed, mode=replace(assumed.mode, drive_limit=limit))
         return SurfaceSetup(scene, settings, assumed, simulated)
 
     def plant(self, setup: SurfaceSetup, seed: int) -> UltrasonicSurface:
         """Return the simulated surface with the scene's finger on it."""
-        loop = amplitude_loop(setup.assumed)
-        return UltrasonicSurface(setup.simulated, loop, setup.scene.finger, seed, (setup.load, setup.speed))
+        loop, nominal = amplitude_loop(setup.assumed), (setup.load, setup.speed)
+        return UltrasonicSurface(setup.simulated, loop, setup.scene.finger, seed, nominal, setup.assumed)
 
     def connect(self, setup: SurfaceSetup, driver: Driver) -> Driver:
         """Return a device at the carrier's rate as a driver of friction; see `ResonantDriver`."""

@@ -396,13 +396,13 @@ def opened_on(device, **fields):
 def known_of(device):
     """Names that the refusals of a misspelt one list."""
     known = []
-    for field, table in (("simulation", "simulation"), ("rendering", "render")):
+    for field, table in (("profile", "device"), ("simulation", "simulation"), ("rendering", "render")):
         with pytest.raises(ValueError, match=rf"^{table}.mispelt = 1.0: unknown key; known: ") as refused:
             opened_on(device, **{field: {"mispelt": 1.0}})
         names = re.sub(r".*known: |; in a file also .*", "", str(refused.value)).split(", ")
         assert names == sorted(set(names))
         known += [(name, table) for name in names if name]
-    return {**dict(known), "rate": "device"}
+    return dict(known)
 
 
 @pytest.mark.parametrize("device", ONE_EACH)
@@ -432,6 +432,15 @@ def test_every_name_is_listed_once_in_order_and_accepted(device):
         ({"device": "hybrid", "simulation": {"method": "h2"}}, r"simulation.method: belongs in \[render\]"),
         ({"device": "hybrid", "simulation": {"rate": 1e4}}, r"simulation.rate: belongs in \[device\]"),
         ({"device": "hybrid", "profile": {"level": "carrier"}}, r"device.level: belongs in \[simulation\]"),
+        ({"device": "ultrasonic", "simulation": {"lock": 0.0}}, r"simulation.lock: belongs in \[device\]"),
+        ({"device": "ultrasonic", "simulation": {"bias": 0.7}}, r"simulation.bias: belongs in \[device\]"),
+        *(
+            (
+                {"device": kind, "simulation": {"open_loop_gain": 1e4}},
+                r"simulation.open_loop_gain: belongs in \[device\]",
+            )
+            for kind in ("electroadhesion", "hybrid")
+        ),
     ],
 )
 def test_a_parameter_in_the_wrong_table_is_sent_to_the_right_one(fields, message):

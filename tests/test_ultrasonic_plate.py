@@ -159,9 +159,10 @@ def loop(p):
     return Proportional(2e5, pulse=p.carrier_mode.carrier / p.carrier_mode.rate)
 
 
-def by_parts(p, drive, whole, load, speed):
-    """True friction, measured friction, amplitude and flags by the parts' own public steps."""
-    mode, law, contact = p.carrier_mode, p.friction_law.numbers, sliding_record(p)
+def by_parts(p, simulated, drive, load, speed):
+    """True friction, measured friction, amplitude and flags by the parts' own public steps; `p` is assumed."""
+    mode, law, contact = simulated.carrier_mode, p.friction_law.numbers, sliding_record(simulated)
+    whole, true_whole = p.friction_coefficient * load, simulated.friction_coefficient * load
     plate, controller = UltrasonicPlate(mode, SLIDE), loop(p)
     decay, slew = 0.5 * float(mode.damping()) / mode.mass / mode.rate, full_slew(mode)
     before, reached, volts, rows = 0.0, -1.0, np.zeros((1, 1)), []
@@ -181,19 +182,26 @@ def by_parts(p, drive, whole, load, speed):
             q, rate = plate.state["z"][0]
             squares.append(q**2 + (rate * mode.rate / (2 * np.pi * float(mode.resonance(load)))) ** 2)
         before, amplitude = wanted, np.sqrt(np.mean(squares))
-        steady = whole * friction_ratio(law, amplitude, load, speed)
+        steady = true_whole * friction_ratio(simulated.friction_law.numbers, amplitude, load, speed)
         rows.append((*sliding_step(contact[0], steady, speed, 0.0), amplitude, flags | (inside != ratio)))
     return np.array(rows)
 
 
 @pytest.mark.parametrize("law", ["fit", "load-sharing", "intermittent"])
-def test_a_surface_is_its_parts(law):
-    """Sample by sample, to the rounding of 1200 steps; what is beyond the law's reach is flagged."""
+@pytest.mark.parametrize(
+    "other", [{}, {"law": "intermittent", "friction_coefficient": 0.5}, {"law": "fit", "bias": 0.9}]
+)
+def test_a_surface_is_its_parts(law, other):
+    """Sample by sample, to the rounding of 1200 steps; what is beyond the law's reach is flagged.
+
+    Where the surface is another than its controller assumes, the reference is by what is assumed.
+    """
     p = parameters(law=law)
-    surface = UltrasonicSurface(p, loop(p), SLIDE, nominal=NOMINAL)
+    simulated = parameters(**{"law": law, **other})
+    surface = UltrasonicSurface(simulated, loop(p), SLIDE, nominal=NOMINAL, assumed=p if other else None)
     drive = np.r_[BUMPS, 0.5]  # N: more than all of the friction
     played = surface.run(drive[:, None])
-    friction, sensed, amplitude, flags = by_parts(p, drive, p.friction_coefficient * 0.4, 0.4, 0.08).T
+    friction, sensed, amplitude, flags = by_parts(p, simulated, drive, 0.4, 0.08).T
     columns = (played.motion[:, 0], played.sensed[:, 0], surface.amplitude)
     for found, expected in zip(columns, (friction, sensed, amplitude), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12 * abs(expected).max())

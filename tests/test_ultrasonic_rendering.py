@@ -21,10 +21,12 @@ from hapticrender.control.probe_resonance import probe_resonance
 from hapticrender.drivers.wavefile import WaveFileDriver
 from hapticrender.loop import prepare, run
 from hapticrender.plants import ultrasonic_surface
+from hapticrender.plants.friction_laws import FitLaw, IntermittentContact, LoadSharing
 from hapticrender.plants.ultrasonic import UltrasonicParameters, UltrasonicPlate
 from hapticrender.plants.ultrasonic_surface import SurfaceParameters
 from hapticrender.protocols import Array, Flag
 from hapticrender.renderers.ultrasonic import amplitude_loop
+from hapticrender.touch.perception import VELOCITY_PER_FORCE
 
 FREE = hr.Finger.absent()
 ASKED = 1e-6  # m
@@ -142,6 +144,59 @@ def friction_errors(recording):
 @pytest.mark.parametrize(("law", "sensor"), [("load-sharing", "amplitude"), ("intermittent", "tribometer")])
 def test_other_laws_and_the_other_sensor(law, sensor):
     assert abs(friction_errors(hr.render(scene(law=law, sensor=sensor)))).max() < PER_CENT
+
+
+def law_error(law, coefficient):
+    """Relative error of a tone of friction by the default design on a surface of another law, from both equations."""
+    design, load, speed = SurfaceParameters(), 0.4, 0.08
+    swing = 10e-3 / VELOCITY_PER_FORCE / (design.friction_coefficient * load)  # mu/mu0
+    tone = np.cos(2 * np.pi * np.arange(1000) / 1000)
+    amplitude = design.friction_law.amplitude(design.bias + swing * tone, load, speed)
+    friction = coefficient / design.friction_coefficient * law.ratio(amplitude, load, speed)
+    return 2 * np.mean(friction * tone) / swing - 1
+
+
+@pytest.mark.parametrize(
+    ("differing", "law"),
+    [
+        ({"friction_coefficient": 0.5}, FitLaw()),
+        ({"friction_coefficient": 1.2}, FitLaw()),
+        ({"floor": 0.2}, FitLaw(floor=0.2)),
+        ({"scale": 1.5e-6}, FitLaw(scale=1.5e-6)),
+        ({"exponent": 1.2}, FitLaw(exponent=1.2)),
+        ({"law": "load-sharing"}, LoadSharing()),
+        ({"law": "intermittent", "coefficient": 1.0}, IntermittentContact(coefficient=1.0)),
+    ],
+)
+def test_a_surface_that_is_not_as_designed_fails_by_what_its_law_says(differing, law):
+    """The controller computes what it senses by the law that it is designed for, and does not see another."""
+    designed, other = (hr.render(replace(scene(), **tables)) for tables in ({}, {"simulation": differing}))
+    error = law_error(law, differing.get("friction_coefficient", 0.8))
+    assert abs(error) > 0.1
+    assert friction_errors(other)[0, 0] == pytest.approx(error, abs=PER_CENT * (1 + error))
+    assert other.summary()["verdict"] == "failed"
+    np.testing.assert_array_equal(other.sensed, designed.sensed)
+    np.testing.assert_array_equal(other.drive, designed.drive)
+    stated = hr.render(replace(scene(), profile=differing))
+    assert abs(friction_errors(stated)).max() < PER_CENT
+    assert stated.summary()["verdict"] == designed.summary()["verdict"] == "passed"
+
+
+def test_a_tribometer_shows_a_wrong_friction_coefficient_which_feedback_corrects():
+    """Open loop it would cost 37.5 %."""
+    wrong = replace(scene(sensor="tribometer"), simulation={"friction_coefficient": 0.5})
+    assert abs(friction_errors(hr.render(wrong))).max() < PER_CENT
+
+
+def test_a_player_on_a_surface_that_is_not_as_designed_shows_it():
+    """Live play has the simulated device of `render`."""
+    shown = []
+    for simulation in ({}, {"friction_coefficient": 0.5}):
+        with hr.Player(replace(scene(), simulation=simulation), paced=False) as player:
+            player.play(scene().texture)
+            player.sleep(0.8)
+            shown.append(player.state().bands[0].achieved)
+    assert shown[1] == pytest.approx(0.625 * shown[0], rel=PER_CENT)
 
 
 def test_a_grating_under_swipes_and_under_a_finger_that_comes_and_goes():

@@ -9,7 +9,8 @@ closed form: with s = b/2m, w_d = sqrt(w^2 - s^2), and e the distance to where t
 Velocities are scaled by the sample period, so that all states are in m.
 
 A sample of the surface is a few samples of the carrier: the amplitude's controller follows, along a straight line, the
-reference that the inverse of the friction law makes of that of friction.
+reference that the inverse of the friction law makes of that of friction.  That law, and the one by which the sensed
+amplitude is read as friction, are those that the controller assumes; the friction is by the surface's own.
 """
 
 import math
@@ -50,10 +51,11 @@ MODE_T = numba.from_dtype(MODE)
 SURFACE = np.dtype(
     [
         ("substeps", "i8"),  # samples of the carrier in one of the surface
-        ("friction_coefficient", "f8"),  # mu0, of the surface at rest
+        ("friction_coefficient", "f8"),  # mu0, of the surface at rest; it and all down to `least_speed` as assumed
         ("bias", "f8"),  # mu/mu0 without drive
         ("least_ratio", "f8"),  # least mu/mu0 of the reference
         ("least_speed", "f8"),  # m/s: a slower finger counts as one at this speed
+        ("true_coefficient", "f8"),  # mu0 of the surface itself
         ("load", "f8"),  # N that the amplitude is held for while no finger is there
         ("speed", "f8"),  # m/s, alike
         ("slew", "f8"),  # m by which the drive can change a zero amplitude in a sample of the carrier
@@ -73,7 +75,8 @@ SURFACE = np.dtype(
         *((name, "f8") for name in ("reference", "goal")),  # state: amplitude (m) before a sample of friction and after
         ("starting", "i8"),  # state: it starts from rest, where the loop's own ramp is slower
         ("reading", "f8"),  # state: friction (N) by the sensed amplitude, output at the next sample
-        ("law", LAW),
+        ("law", LAW),  # as assumed
+        ("true_law", LAW),  # of the surface itself
         ("mode", MODE),
         ("sliding", SLIDING),
     ],
@@ -150,6 +153,7 @@ def sliding_reference(s, drive, load, speed):
     """Reference (m) of the amplitude for a friction `drive` (N) under a finger (N, m/s; NaN while lifted).
 
     Before it whole friction (N, 0 where no finger slides), load (N) and speed (m/s) for which it holds; then flags.
+    Friction coefficient and law are those that the controller assumes.
     """
     touching = not math.isnan(speed) and load > 0.0
     whole = s.friction_coefficient * load if touching else 0.0
@@ -193,7 +197,7 @@ def surface_step(state, signals, start, count):
         speed = x[SPEED]
         whole, load, pace, s.goal, delayed = sliding_reference(s, drive[n], x[LOAD], speed)
         amplitude, raised = amplitude_pass(s, x, noise[n])
-        steady = whole * friction_ratio(s.law, amplitude, load, pace)
+        steady = s.true_coefficient * load * friction_ratio(s.true_law, amplitude, load, speed)
         friction, reading = sliding_step(s.sliding, steady, speed, noise[n, 0])
         if s.estimating:
             reading, (re, im) = s.reading, observed_envelope(s.controller_state)

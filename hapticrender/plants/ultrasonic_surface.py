@@ -172,9 +172,10 @@ def full_slew(mode: UltrasonicParameters) -> float:
 class UltrasonicSurface(CompiledPlant):
     """The surface in discrete time, behind the `Plant` protocol.
 
-    `amplitude` is the amplitude loop, designed for `parameters.amplitude_model()` and `parameters.amplitude_bands()`,
-    with a compiled step that takes single samples; it holds the `nominal` load (N) and speed (m/s) while no finger is
-    there.  `motion`: friction (N), and the amplitude (m).
+    `amplitude` is the amplitude loop, designed for `amplitude_model()` and `amplitude_bands()` of the surface that is
+    `assumed` (by default that of `parameters`), with a compiled step that takes single samples; it holds the `nominal`
+    load (N) and speed (m/s) while no finger is there.  By the assumed law the amplitude's reference is computed, and
+    the friction that the sensed amplitude leaves.  `motion`: friction (N), and the amplitude (m).
     """
 
     step = surface_step
@@ -187,11 +188,13 @@ class UltrasonicSurface(CompiledPlant):
         finger: Finger,
         seed: int = 0,
         nominal: tuple[float, float] = (0.5, 0.05),
+        assumed: SurfaceParameters | None = None,
     ) -> None:
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters, self.loop = parameters, amplitude
         self.noise_channels = 1 + parameters.substeps
         p, mode, ours = parameters, parameters.carrier_mode, isinstance(amplitude, BankController)
+        assumed = assumed or parameters
         inner, queue = mode_record(mode, mode.delay - 1)
         if p.sensor == "amplitude" and not ours:
             raise TypeError(
@@ -200,7 +203,8 @@ class UltrasonicSurface(CompiledPlant):
         self.buffers = (queue,)
         self.state = record_of(
             SURFACE,
-            p,
+            assumed,
+            true_coefficient=p.friction_coefficient,
             load=nominal[0],
             speed=nominal[1],
             slew=full_slew(mode),
@@ -211,7 +215,8 @@ class UltrasonicSurface(CompiledPlant):
             finger_damping=amplitude.state["finger_damping"].ctypes.data if ours else 0,
             position=np.nan,
             starting=1,
-            law=p.friction_law.numbers,
+            law=assumed.friction_law.numbers,
+            true_law=p.friction_law.numbers,
             mode=inner[0],
             sliding=sliding_record(p)[0],
         )
