@@ -95,8 +95,8 @@ class ElectroadhesionRenderer(FrictionRenderer):
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen with the scene's finger on it."""
-        parameters = replace(setup.simulated, open_loop_gain=setup.open_loop_gain)
-        return ElectroadhesionScreen(parameters, setup.scene.finger, seed, setup.compensation)
+        assumed = replace(setup.assumed, open_loop_gain=setup.open_loop_gain)
+        return ElectroadhesionScreen(setup.simulated, setup.scene.finger, seed, setup.compensation, assumed)
 
     def connect(self, setup: ScreenSetup, driver: Driver) -> Driver:
         """Return `driver` behind the square root: it gets the current's envelope (A, peak), or the carrier.

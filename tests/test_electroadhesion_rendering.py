@@ -34,6 +34,21 @@ def test_a_tone_follows_its_target_whatever_the_finger(frequency, finger):
     assert not recording.flags[RATE:].any()
 
 
+@pytest.mark.parametrize(("table", "error"), [("profile", 0.0), ("simulation", 0.3)])
+def test_an_impedance_is_read_by_what_is_assumed_of_the_screen(table, error):
+    """An unevenness of 1.3 makes 1.3 times the attraction of the same current and gap."""
+    tables = {"profile": {"sensor": "impedance"}, "simulation": {"level": "carrier"}}
+    tables[table]["unevenness"] = 1.3
+    scene = hr.Scene(
+        texture=hr.Grating(frequency=100.0, amplitude=20e-6),
+        finger=SLIDE,
+        device="electroadhesion",
+        duration=2.0,
+        **tables,
+    )
+    assert hr.render(scene).summary()["worst"]["value"] == pytest.approx(error, abs=0.01)
+
+
 def test_a_friction_coefficient_other_than_assumed_is_corrected():
     """A driver of the user's own, whose finger has another mu than the scene's 0.8."""
     screen = Screen(blind=False, block=10, friction_coefficient=0.5)

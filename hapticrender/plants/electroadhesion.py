@@ -173,8 +173,8 @@ class ElectroadhesionScreen(CompiledPlant):
     """The screen in discrete time, behind the `Plant` protocol.
 
     The drive is the peak of the carrier (A or V); a `compensation` makes it an attraction around its bias (N), by a
-    gain in N/A^2, or N/V^2 where a voltage is driven.  `motion`: friction (N), and the mean
-    attraction of each sample (N).
+    gain in N/A^2, or N/V^2 where a voltage is driven.  An impedance sensor estimates the attraction by the parameters
+    `assumed`, else the screen's own.  `motion`: friction (N), and the mean attraction of each sample (N).
     """
 
     step = screen_step
@@ -186,6 +186,7 @@ class ElectroadhesionScreen(CompiledPlant):
         finger: Finger,
         seed: int = 0,
         compensation: SquareRoot | None = None,
+        assumed: ElectroadhesionParameters | None = None,
     ) -> None:
         super().__init__(finger, parameters.rate, seed=seed)
         self.parameters = parameters
@@ -207,7 +208,7 @@ class ElectroadhesionScreen(CompiledPlant):
             capacitance=(p.insulator_capacitance, p.corneum_capacitance, VACUUM / p.gap_thickness),
             retention=[each[0] for each in elements],
             alternating=[each[1] for each in elements],
-            gap=gap_record(p)[0],
+            gap=gap_record(assumed or p)[0],
             sliding=sliding_record(p)[0],
         )
 
