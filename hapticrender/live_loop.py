@@ -34,6 +34,7 @@ DEVICE = ("driver", "device", "plant")  # of a rendering: they stay where its te
 CATCH_UP, MOST_CONSTANTS = 5e-3, 100.0  # s: time constant of either pole; what is left after so many is 0
 TURN = 2e-3  # s: a simulated device held to the clock is played for so long at once
 PIECE, SPELL = 0.25, 0.5  # s: of a texture, computed at once; after which other work has its turn
+DERIVATIVE = np.array([5 / 6, -5 / 21, 5 / 84, -5 / 504, 1 / 1260])  # central differences, exact to the tenth order
 REFRESH = 0.02  # s: after which a texture in time and place is evaluated again while its finger goes on as it did
 CHANGES = "current", "previous", "finger_changes"  # of an entry: after which it is evaluated at once
 RIDGE = 1e-4  # of the samples: bands that the time cannot tell apart share what there is, and do not blow up
@@ -266,15 +267,16 @@ class LiveLoop(RealtimeEntry):
 
     def signals(self, start: int) -> tuple[int, dict[str, Array]]:
         """Signals of a recording from sample `start` on, as far back as they are kept, and the first one's number."""
-        derived = self.rendering.differentiated  # by central differences: a sample before, and one after
-        found = self.log(start - getattr(self.driver, "early", 1) if derived else start)
+        derived, reach = self.rendering.differentiated, len(DERIVATIVE)  # samples before, and after
+        found = self.log(start - max(getattr(self.driver, "early", 1), reach) if derived else start)
         first = int(found.pop("first"))
         if self._calls_back and hasattr(self.driver, "skin") and self.driver.sensed_channels:
             self._has_motion, found["motion"] = True, self.driver.skin(found["sensed"], found["position"])
         if derived:
-            enough, skip = len(found["flags"]) > 2, max(start - first, 0)
-            found["reference"] = np.gradient(found["reference"]) * self.driver.rate if enough else found["reference"]
-            rows = slice(skip, -1 if enough else skip)
+            enough, skip = len(found["flags"]) > 2 * reach, max(start - first, 0)
+            weights = np.r_[DERIVATIVE[::-1], 0.0, -DERIVATIVE] * self.driver.rate
+            found["reference"] = np.convolve(found["reference"], weights, "same") if enough else found["reference"]
+            rows = slice(skip, -reach if enough else skip)
             first, found = first + skip, {name: signal[rows] for name, signal in found.items()}
         if self.model.finger.needs_contact:  # as `Rendering.requested`
             found["reference"] = np.where(np.isnan(found["position"]), 0.0, found["reference"])

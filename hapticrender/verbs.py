@@ -245,7 +245,8 @@ def identify(arguments: argparse.Namespace) -> int:
             elif scene.device == "electroadhesion":
                 found = identify_screen(opened, setup.assumed, scene.finger)
             else:
-                found = identify(opened, setup.assumed, seconds=arguments.seconds, amplitude=arguments.amplitude)
+                options = {"amplitude": arguments.amplitude, "limits": scene.device_profile.limits}
+                found = identify(opened, setup.assumed, seconds=arguments.seconds, **options)
                 found = found.shortened(getattr(driver, "host_delay", 0))
     print(found.text())
     assumed = setup.assumed

@@ -87,11 +87,10 @@ class ElectroadhesionRenderer(FrictionRenderer):
     def read(self, scene: Scene, driver: Driver | None) -> ScreenSetup:
         """Read the tables of a scene; refuses one that needs more attraction than the source can make."""
         tables = read_tables(scene, ElectroadhesionParameters, ElectroadhesionSettings, LEVEL, design=DESIGN)
-        setup = ScreenSetup(scene, *tables)
-        assumed, current = setup.assumed, setup.assumed.drive_kind == "current"
-        source = (assumed.current_limit, "A") if current else (assumed.voltage_limit, "V")
-        carrier_limit(scene.device_profile.limits, *source)  # refuses what no finger's load could make right
-        return setup
+        settings, assumed, simulated = tables
+        name, unit = ("current_limit", "A") if assumed.drive_kind == "current" else ("voltage_limit", "V")
+        most = carrier_limit(scene.device_profile.limits, getattr(assumed, name), unit)
+        return ScreenSetup(scene, settings, replace(assumed, **{name: most}), simulated)
 
     def plant(self, setup: ScreenSetup, seed: int) -> ElectroadhesionScreen:
         """Return the simulated screen with the scene's finger on it."""

@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 
 import numpy as np
 import pytest
@@ -165,6 +166,35 @@ def test_a_bending_mode_is_found_from_five_standard_deviations_on():
         assert none.profile()["bending_frequency"] == 0.0
         assert designed_for(plate, none.profile()).rigid
     assert designed_for(plate, {}).bending.measured is False
+
+
+shown = []  # by the plate that the command line opens
+
+
+def keep(sample, sensed):
+    shown.append(sensed.sensed.copy())
+    return sensed
+
+
+@pytest.mark.parametrize(
+    ("limits", "bounds"),
+    [({}, (1.0, 1.0, 200e-6)), ({"peak_drive": 0.1}, (0.1, 1.0, 1.0)), ({"rms_drive": 0.05}, (1.0, 0.05, 1.0))]
+    + [({"displacement": 40e-6}, (1.0, 1.0, 40e-6))],
+)
+def test_the_limits_of_the_device_are_held_while_it_is_identified(tmp_path, monkeypatch, limits, bounds):
+    """Without any 0.8 A, 0.3 A rms and more than 40 um; by the command line, from a scene."""
+    scene = tmp_path / "scene.toml"
+    scene.write_text(
+        hr.Scene(texture=hr.Grating(frequency=72.0, amplitude=5e-6), duration=1.0, limits=limits).to_toml()
+    )
+    driver = OtherPlate(seed=2, spoil=keep)
+    monkeypatch.setattr(sys.modules[__name__], "watched", lambda: driver, raising=False)
+    shown.clear()
+    assert cli.main(["identify", "--driver", f"{__name__}:watched", "--scene", str(scene)]) == 0
+    drive, sensed = np.concatenate(driver.played), np.concatenate(shown)
+    found = abs(drive).max(), np.sqrt((drive**2).mean(axis=0)).max(), abs(sensed).max()
+    assert (np.array(found) <= bounds).all()
+    assert limits or (np.array(found) > (0.5, 0.2, 60e-6)).all()
 
 
 def test_a_third_partys_plate_is_held_although_everything_is_wrong():

@@ -124,6 +124,15 @@ def test_a_rate_below_twice_the_carrier_is_refused_before_anything_is_played():
 
 
 @pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"sensor": "impedance", "level": "carrier"}, "device.sensor"), ({"drive_kind": "voltage"}, "device.drive_kind")],
+)
+def test_a_screen_is_identified_by_a_tribometer_and_a_current(changes, message):
+    with pytest.raises(ValueError, match=f"{message} = .*: must be .* to identify a screen"):
+        identify_screen(Screen(), ElectroadhesionParameters(**changes), hr.Finger.absent())
+
+
+@pytest.mark.parametrize(
     ("kind", "profile", "expected"),
     [
         ("ultrasonic", {"rate": 3e3, "frequency": 22e3}, {"frequency": 22e3, "quality": 200.0}),  # 16 of drive to one

@@ -428,14 +428,19 @@ class Probed(Watched):
         ({"noise": 20e-6}, "the sensors' noise is (19|2.) um rms, more than .* um: the probe cannot judge"),
         ({"noise": 4e-6, "sensors": INVERT, **FREE}, "sensor 1 is inverted"),
         ({"noise": 2e-6, "coils": np.zeros((2, 2))}, "nothing moves"),
+        (
+            {"limits": {"peak_drive": 0.05}},
+            "the sensors' noise is 1.. um rms, more than .* the probe cannot judge by 0.0.* A",
+        ),
     ],
 )
 def test_the_probe_refuses_what_is_wired_wrongly(monkeypatch, wiring, named):
     """Under a finger, which leaves less to tell it by; in one try, but in all three where noise decides."""
     monkeypatch.setattr(probe, "TRIES", 3 if "noise" in wiring else 1)
-    plate = Probed(**FINGER | wiring)
+    limits = wiring.get("limits", {})
+    plate = Probed(**FINGER | {name: value for name, value in wiring.items() if name != "limits"})
     with pytest.raises(hr.DeviceFault, match=f"refused by the start-up probe: .*({named})"):
-        hr.render(scene(), driver=plate)
+        hr.render(scene(limits=limits), driver=plate)
     assert max(plate.motion) < 50e-6
     assert abs(np.concatenate(plate.played)).max() < 0.05 * 3.0
     assert not plate.is_open

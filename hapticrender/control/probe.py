@@ -126,17 +126,20 @@ def judge(model: DeviceModel, drive: Array, sensed: Array) -> Found:
     residuals, scales, model_energy = _compared(model, drive, y, delays)
     energy = float((y**2).sum())
     noise = float(np.diff(silence, 2, axis=0).std() / 6**0.5) if len(silence) else 0.0  # of white noise
+    most = MOST_NOISE * (model_energy / y.size) ** 0.5
+    noisy = f"the sensors' noise is {1e6 * noise:.2g} um rms, more than {1e6 * most:.2g} um: the probe cannot judge"
     if energy - noise**2 * y.size < LEAST_ENERGY * model_energy:
+        if noise > most:  # as by a limit of the drive that leaves too little of it
+            return Found(f"{noisy} by {abs(drive).max():.2g} {model.drive_unit}", np.nan, np.nan, -1)
         return Found("nothing moves: sensors or actuators are dead", np.nan, (energy / model_energy) ** 0.5, -1)
     if (repeats > MOST_REPEATS).any():
         return Found(f"sensor {1 + int(repeats.argmax())} repeats its values", np.nan, np.nan, -1)
     best = min(residuals, key=lambda each: residuals[each])
     own = min((each for each in residuals if each[0] == "nothing"), key=lambda each: residuals[each])
     scale, delay = scales[own], own[1] + model.block
-    most = MOST_NOISE * (model_energy / y.size) ** 0.5
     fault = ""
     if min(residuals[own], residuals[best] + MOST_WORSE) > MOST_RESIDUAL and noise > most:
-        fault = f"the sensors' noise is {1e6 * noise:.2g} um rms, more than {1e6 * most:.2g} um: the probe cannot judge"
+        fault = noisy
     elif residuals[own] > residuals[best] + MOST_WORSE:
         fault = best[0]
     elif residuals[own] > MOST_RESIDUAL:

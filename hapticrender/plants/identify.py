@@ -37,6 +37,7 @@ from hapticrender.plants.multisine import Multisine, design_multisine
 from hapticrender.plants.plate import Plate, PlateParameters
 from hapticrender.process_signals import stopped_by_signal
 from hapticrender.protocols import Array, Driver, Flag, Sensed
+from hapticrender.touch.device_profile import Limits
 from hapticrender.touch.finger import Finger
 
 NAMES = (*MECHANICAL, "delay", "gain_difference")  # and `BENDING` where a mode was found
@@ -44,6 +45,7 @@ UNITS = {each.name: each.metadata["bounds"]["unit"] for each in fields(PlatePara
 RAMP = 0.05  # s: fade-in and fade-out of the drive
 WAIT, LEAST_WAIT = 0.3, 0.25  # s, from the first drive to the record; from the first motion, behind a long delay
 SIGMAS_95 = 1.96
+STRANGE = 0.5  # of the limit of displacement, on the expected plate: the plate may be another one
 CLEAR = 10.0  # least amplitude of the lines over the noise between them
 UNEXPLAINED = 0.01  # largest share of the motion that the model may leave
 TRIES = 10  # where samples are lost
@@ -156,6 +158,7 @@ def identify(
     *,
     seconds: float = 1.0,
     amplitude: float = 100e-6,
+    limits: Limits = Limits(),  # noqa: B008 - frozen
 ) -> Identified:
     """Identify the free plate behind a driver from the response to a multi-sine.
 
@@ -173,6 +176,9 @@ def identify(
         the driver's delay is above 0.05 s: delays of 0.25 s are identified, and of 0.2 s beyond that stated.
     amplitude : float, m, > 0
         Largest displacement of a glass end, on the expected plate; less where the driver's `drive_limit` allows less.
+    limits : Limits
+        Of the device: of peak and rms drive (of the record), and of displacement, of which half is used, as the plate
+        may not be the expected one.
 
     Raises
     ------
@@ -193,22 +199,28 @@ def identify(
     if isinstance(driver, str):
         made = open_driver(driver) or registered("drivers", "simulated")(Plate(parameters, Finger.absent(), seed=0))
         with stopped_by_signal(), naming_driver(driver), made as opened:
-            found = identify(opened, parameters, seconds=seconds, amplitude=amplitude)
+            found = identify(opened, parameters, seconds=seconds, amplitude=amplitude, limits=limits)
         return found.shortened(getattr(made, "host_delay", 0))
     with driver.by_host() if hasattr(driver, "by_host") else nullcontext(driver) as player:
-        found = _fitted(player, parameters, seconds, amplitude)
+        found = _fitted(player, parameters, seconds, amplitude, limits)
     return found.shortened(player.delay - driver.delay)
 
 
-def _fitted(driver: Driver, parameters: PlateParameters, seconds: float, amplitude: float) -> Identified:
+def _fitted(
+    driver: Driver, parameters: PlateParameters, seconds: float, amplitude: float, limits: Limits
+) -> Identified:
     """As `identify`, by the open driver's `play`."""
     rate = float(driver.rate)
     samples = _samples(driver, parameters, seconds)
     wait = max(WAIT, driver.delay / rate + LEAST_WAIT)
     parameters = replace(parameters, rate=rate)
+    amplitude = min(amplitude, STRANGE * (limits.displacement or math.inf))
     sine = design_multisine(parameters, rate, samples, amplitude)
-    if (peak := abs(sine.drive).max()) > (limit := getattr(driver, "drive_limit", math.inf)):
-        amplitude *= (limit - parameters.current_step) / peak
+    bounds = (getattr(driver, "drive_limit", math.inf), limits.peak_drive or math.inf, limits.rms_drive or math.inf)
+    drives = *[abs(sine.drive).max()] * 2, np.sqrt((sine.drive**2).mean(axis=0)).max()
+    share = min((bound - parameters.current_step) / drive for bound, drive in zip(bounds, drives, strict=True))
+    if share < 1.0:
+        amplitude *= max(share, 0.0)
         sine = design_multisine(parameters, rate, samples, amplitude)
     start, fade = round(wait * rate), round(RAMP * rate)
     sensed = play(driver, _whole_drive(sine, start, fade)).sensed[start : start + samples]

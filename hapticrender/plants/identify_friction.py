@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from hapticrender.checks import require
 from hapticrender.driver_checks import check_channels, check_driver
 from hapticrender.errors import DesignError
 from hapticrender.plants.electroadhesion import ElectroadhesionParameters
@@ -123,6 +124,9 @@ def identify_screen(
     `finger` gives load and position where it does not measure them.
     """
     rate, most = float(driver.rate), parameters.current_limit / 2
+    for name, known in (("sensor", "tribometer"), ("drive_kind", "current")):
+        value = getattr(parameters, name)
+        require(value == known, f"device.{name}", value, f"{known!r} to identify a screen")
     check_driver(driver)
     check_channels(driver, ONE, ONE)
     time = np.arange(round(seconds * rate)) / rate
