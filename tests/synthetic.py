@@ -68,9 +68,3 @@ def summary_of(bands, signals, header=None, **scene):
     recorder.header = replace(recorder.header, **(header or {}))
     recorder.append(**signals)
     return recorder.finish().summary()
-
-
-def judged(reference, motion, **fields):
-    """Figures of the centre, and the verdict, of a waveform without bands."""
-    summary = make_play(reference, motion, **fields).summary()
-    return summary["waveform"]["places"]["centre"], summary["verdict"]

@@ -6,17 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from synthetic import (
-    RATE,
-    judged,
-    make_bands,
-    make_play,
-    make_recorder,
-    make_recording,
-    make_signals,
-    summary_of,
-    times,
-)
+from synthetic import RATE, make_bands, make_play, make_recorder, make_recording, make_signals, summary_of, times
 
 import hapticrender as hr
 from hapticrender.protocols import Flag
@@ -175,6 +165,38 @@ def test_what_has_no_figure_is_not_judged(bands, fields, reason):
     json.dumps(summary, allow_nan=False)
 
 
+@pytest.mark.parametrize(
+    ("frequency", "seconds"), [*((each, 4.0) for each in (15.0, 17.0, 18.0, 501.0, 502.0, 503.0)), (5.0, 0.4)]
+)
+def test_a_tone_beside_the_band_is_not_judged_whatever_the_motion(rng, frequency, seconds):
+    """No figure divides by what is left of it in the band: 1 nm of noise beside it read 1e9 %."""
+    tone = 10 * UM * np.cos(2 * np.pi * frequency * times(seconds))
+    for motion in (tone, 0.0 * tone, tone + 1e-9 * rng.standard_normal(len(tone))):
+        summary = make_play(tone, motion).summary()
+        assert (summary["verdict"], summary["worst"]["value"]) == ("not judged", None)
+        assert summary["reason"] == "the texture has nothing from 20 to 500 Hz"
+
+
+@pytest.mark.parametrize("frequency", [20.0, 21.0, 499.0])
+@pytest.mark.parametrize(("gain", "found"), [(0.91, "passed"), (0.89, "failed")])
+def test_a_tone_at_an_edge_of_the_band_is_judged(frequency, gain, found):
+    tone = 10 * UM * np.cos(2 * np.pi * frequency * times(4.0))
+    figures, verdict = judged(tone, gain * tone)
+    assert verdict == found
+    assert figures["waveform_error"] == pytest.approx(1.0 - gain, rel=1e-6)
+
+
+@pytest.mark.parametrize("outside", [5.0, 900.0])
+@pytest.mark.parametrize(("gain", "found"), [(0.92, "passed in band"), (0.88, "failed")])
+def test_a_thousandth_of_the_energy_in_the_band_is_judged_by_itself(outside, gain, found):
+    far, near = (30 * UM * np.cos(2 * np.pi * hertz * times(4.0)) for hertz in (outside, 90.0))
+    near *= math.sqrt(1e-3)
+    summary = make_play(far + near, far + gain * near).summary()
+    assert summary["verdict"] == found
+    assert summary["waveform"]["share_outside"] == pytest.approx(0.999, abs=1e-5)
+    assert summary["waveform"]["places"]["centre"]["waveform_error"] == pytest.approx(1.0 - gain, rel=0.01)
+
+
 def test_a_long_journal_is_judged_without_being_loaded(tmp_path, monkeypatch):
     """A minute of 14 columns is 34 MB; in pieces of a quarter judging takes less than seven tenths of that.
 
@@ -205,6 +227,11 @@ def white(low, high, rng, seconds=4.0, rms=5 * UM):
     spectrum[kept] = np.exp(2j * np.pi * rng.random(kept.stop - kept.start))
     values = np.fft.irfft(spectrum)
     return values * rms / np.std(values)
+
+
+def judged(reference, motion, **fields):
+    summary = make_play(reference, motion, **fields).summary()
+    return summary["waveform"]["places"]["centre"], summary["verdict"]
 
 
 def test_errors_of_white_noise_are_those_of_theory(rng):

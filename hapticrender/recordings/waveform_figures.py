@@ -23,9 +23,8 @@ from hapticrender.touch.perception import VELOCITY_PER_FORCE, detection_threshol
 
 BAND = (20.0, 500.0)  # Hz
 HIGHEST = 0.4  # of the rate: B ends there at low rates
-ORDER = 12  # of the Butterworth low pass and high pass, run both ways: half the amplitude is left at the edges
-AFTER_ORDER = 4  # of the high pass after contacts: one of 12th order rings on there, and reads up to twice as much
-MARGIN = 0.5  # s around a piece, in which the filters settle
+ORDERS = (4, 12)  # of the Butterworth high pass and low pass, run both ways: half the amplitude is left at the edges
+MARGIN = 0.25  # s around a piece, in which the filter settles
 WINDOW = 0.1  # s
 SEGMENT = 10  # windows in a segment of the spectra (Hann, half overlapping): 1 s
 WORST_WINDOWS = 95.0  # percentile
@@ -156,21 +155,16 @@ def _without_base(friction: Array, touching: Array, felt: Array) -> Array:
     return friction
 
 
-def _filtered(recording: Recording, start: int, stop: int, order: int = ORDER) -> Array:
-    """`_signals` within B, by a high pass of that order.
-
-    Beyond the ends of a run the low pass goes on with their mirror image, in which a motion above B makes no step, the
-    high pass with that turned about the last sample, in which one below B makes no kink.
-    """
+def _filtered(recording: Recording, start: int, stop: int) -> Array:
+    """`_signals` within B."""
     from scipy.signal import butter, sosfiltfilt
 
-    margin, (low, high) = round(MARGIN * recording.rate), _band(recording.rate)
+    margin = round(MARGIN * recording.rate)
     first = max(start - margin, 0)
+    sides = zip(ORDERS, _band(recording.rate), ("highpass", "lowpass"), strict=True)
+    sections = np.vstack([butter(order, edge, kind, fs=recording.rate, output="sos") for order, edge, kind in sides])
     signals = np.nan_to_num(_signals(recording, first, min(stop + margin, _end(recording))))
-    for each, edge, kind, mirror in ((ORDER, high, "lowpass", "even"), (order, low, "highpass", "odd")):
-        sections = butter(each, edge, kind, fs=recording.rate, output="sos")
-        signals = sosfiltfilt(sections, signals, axis=0, padtype=mirror, padlen=min(margin, len(signals) - 1))
-    return signals[start - first : stop - first]
+    return sosfiltfilt(sections, signals, axis=0, padlen=min(margin, len(signals) - 1))[start - first : stop - first]
 
 
 def _power(recording: Recording, start: int, stop: int, window: int) -> Array:
@@ -258,7 +252,7 @@ def _contacts(recording: Recording, begin: int, stop: int, rms: float) -> dict[s
     for start in range(begin, stop, READ_AT_ONCE):
         here = events[(events >= start) & (events < start + READ_AT_ONCE)]
         if here.size:
-            values = _filtered(recording, here[0], here[-1] + edges[-1], AFTER_ORDER)[:, 1:]
+            values = _filtered(recording, here[0], here[-1] + edges[-1])[:, 1:]
             power = np.concatenate([0 * values[:1], np.cumsum(values**2, axis=0)])
             at = here[:, None] - here[0] + np.array(edges)
             squares.append(np.diff(power[at], axis=1) / np.diff(edges)[:, None])
