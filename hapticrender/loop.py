@@ -31,7 +31,7 @@ from hapticrender.recordings.recording import Recorder, Recording
 from hapticrender.touch.composed import is_in_time, refuse_to_overwrite
 from hapticrender.touch.scene import Scene
 
-LOST = "which may be all that is wrong: free the computer, or take larger blocks"
+LOST = "lost, which may be all that is wrong: free the computer, or take larger blocks"
 MISMATCH = 0.03  # of what the model asks for: most that the controller may have to add on the untouched device
 RECENT = 0.1  # s before a stop, of which it is said how many samples were lost
 CHUNK = 0.25  # s of signal between two writes of the journal
@@ -214,7 +214,7 @@ def device_fault(rendering: Rendering, controller: Any, sample: int, flags: Arra
     text = next((each.text for each in found if isinstance(each, Fault)), "the device stopped itself")
     time, lost = sample / rendering.driver.rate, int(np.count_nonzero(flags & Flag.OVERRUN))
     if lost:
-        text = f"{lost} of the {len(flags)} samples until then were lost, {LOST}; found was: {text}"
+        text = f"{lost} of the {len(flags)} samples until then were {LOST}; found was: {text}"
     return DeviceFault(f"{type(rendering.device).__name__}: stopped at {time:.4g} s: {text}", time)
 
 
@@ -470,7 +470,7 @@ def differences(rendering: Rendering, controller: object, lost: int) -> tuple[st
         cure = "correct [device]"
         if rendering.scene.device == "vt-plate":
             cure = "remove the finger and take the profile that `hapticrender identify --driver ... --scene ...` writes"
-        first = f"{lost} samples were lost, {LOST}; found was: " if lost else ""
+        first = f"of the samples {lost} were {LOST}; found was: " if lost else ""
         differs = f"the device differs from its model{f', profile {source}' if source else ''}"
         messages.append(f"{first}{differs}: {adds}; {cure}")
     return tuple(messages)

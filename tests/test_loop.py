@@ -194,7 +194,7 @@ def test_a_scene_may_state_a_plate_that_the_controller_does_not_assume():
     wrong = scene_with(duration=3.0, simulation=stiff)
     with pytest.warns(hr.PlateMismatch, match=r"^the device differs.*the controller adds \d"):
         hr.render(wrong)
-    with pytest.warns(hr.PlateMismatch, match="^14 samples were lost, which may be all .*the controller adds"):
+    with pytest.warns(hr.PlateMismatch, match="^of the samples 14 were lost, which may be all .*the controller adds"):
         hr.render(wrong, driver=simulated(wrong, kind=Losing, block=7, delay=7, **stiff))
     late = loop.prepare(scene_with(simulation={"delay": 5}))
     assert (late.plant.parameters.delay, late.model.delay) == (5, 1)

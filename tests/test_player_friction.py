@@ -78,7 +78,7 @@ VIBRATING = {
 
 @pytest.mark.parametrize("kind", ["electroadhesion", "ultrasonic", "hybrid"])
 def test_the_target_is_that_of_a_run(kind):
-    """Of 400 Hz, as `render` has it, within 0.1 %: a difference over two samples would read 1 % less of it at 10 kHz."""
+    """Of 400 Hz, as `render` has it, within 0.1 %: a difference over two samples reads 1 % less of it at 10 kHz."""
     texture, finger = hr.Grating(frequency=400.0, amplitude=2e-6), hr.Finger.sliding(speed=0.08, normal_load=0.4)
     scene = hr.Scene(texture=texture, finger=finger, device=kind, duration=0.8)
     with hr.Player(scene, paced=False) as player:

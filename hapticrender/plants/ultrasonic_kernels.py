@@ -197,7 +197,7 @@ def surface_step(state, signals, start, count):
         speed = x[SPEED]
         whole, load, pace, s.goal, delayed = sliding_reference(s, drive[n], x[LOAD], speed)
         amplitude, raised = amplitude_pass(s, x, noise[n])
-        steady = s.true_coefficient * load * friction_ratio(s.true_law, amplitude, load, speed)
+        steady = s.true_coefficient * x[LOAD] * friction_ratio(s.true_law, amplitude, load, speed)
         friction, reading = sliding_step(s.sliding, steady, speed, noise[n, 0])
         if s.estimating:
             reading, (re, im) = s.reading, observed_envelope(s.controller_state)
